@@ -1,0 +1,32 @@
+"""Fixtures that several test modules share."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.logs import FRAMES, Log, wrist_parts, write_log
+
+REFERENCE = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def wrist_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a recording of the wrist that nobody may change or write beside."""
+    return write_log(tmp_path_factory.mktemp("wrist") / "wrist.mcap", wrist_parts())
+
+
+@pytest.fixture
+def wrist(wrist_file: Path, tmp_path: Path) -> Log:
+    """Return a recording of the wrist in a directory of the test's own."""
+    return Log(Path(shutil.copy(wrist_file, tmp_path / "wrist.mcap")), FRAMES)
+
+
+@pytest.fixture(scope="session")
+def reference_data() -> Path:
+    """Return the folder of reference data; it lies beside the repository, never in it."""
+    if not REFERENCE.is_dir():
+        pytest.skip(f"the reference data is not at {REFERENCE}")
+    return REFERENCE

@@ -1,0 +1,128 @@
+"""``tooltip estimate``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tooltip_cli.cli.options import (
+    PATH,
+    check_names,
+    force_option,
+    jobs_option,
+    json_option,
+    out_option,
+    print_json,
+    progress,
+    recordings_argument,
+    rig_option,
+    say,
+    topic_options,
+)
+
+METHODS = ("kmeans", "map")
+
+
+@click.command()
+@recordings_argument
+@rig_option
+@click.option(
+    "--method",
+    type=click.Choice(METHODS),
+    default="kmeans",
+    show_default=True,
+    help="kmeans: the paper's section 3.2. map: its appendix B.",
+)
+@click.option(
+    "--from-labels",
+    type=PATH,
+    metavar="CSV",
+    help="Estimate from these hand labels instead of detections (the paper's baseline).",
+)
+@jobs_option
+@out_option
+@topic_options
+@force_option
+@json_option
+@click.pass_context
+def estimate(
+    ctx: click.Context,
+    recordings: tuple[Path, ...],
+    rig: Path | None,
+    method: str,
+    from_labels: Path | None,
+    jobs: int,
+    out: Path | None,
+    image: str | None,
+    joints: str | None,
+    info: str | None,
+    pose: str | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Find the 3D tip in the hand frame.
+
+    Uses the detections of 'tooltip detect', making them first where they are missing or out of
+    date, and the robot's kinematics. Writes STEM.tip.json. Exits with 3 when the answer cannot be
+    trusted; the file then says why.
+
+    \b
+    Examples:
+      tooltip estimate pliers.mcap
+      tooltip estimate pliers.mcap --rig robot.rig.yaml --method map
+      tooltip estimate pliers.mcap --from-labels pliers.labels.csv
+    """
+    from tooltip_cli.log.recording import Topics
+    from tooltip_cli.method.estimators import EstimatorParams
+    from tooltip_cli.stages.estimate import estimate as run
+
+    documents: list[dict[str, Any]] = []
+    refusals = 0
+    check_names(recordings, out)
+    for path in recordings:
+        with progress(None, f"detect {path.name}, pairs") as advance:
+            found = run(
+                path,
+                rig=rig,
+                topics=Topics(image=image, joints=joints, info=info, pose=pose),
+                params=EstimatorParams(method=method),
+                from_labels=from_labels,
+                out=out,
+                force=force,
+                jobs=jobs,
+                on_pair=advance,
+            )
+        for note in found.notes:
+            say(f"{path}: {note}")
+        if found.detected is not None:
+            how = "reused" if found.detected.reused else "computed"
+            say(f"{path}: {how} {found.detected.path}")
+        say(f"{path}: {'reused' if found.reused else 'computed'} {found.path}")
+        for reason in found.estimate.reasons:
+            say(f"{path}: {found.estimate.status}: {reason.code}: {reason.text}")
+        refusals += found.estimate.position is None
+        documents.append(found.document)
+        if not as_json:
+            click.echo(_sentence(path, found.document))
+    if as_json:
+        print_json(documents[0] if len(documents) == 1 else documents)
+    if refusals:
+        ctx.exit(3)
+
+
+def _sentence(path: Path, document: dict[str, Any]) -> str:
+    if document["status"] == "refused":
+        codes = ", ".join(reason["code"] for reason in document["reasons"])
+        return f"{path.stem}: refused ({codes})"
+    position = document["tip"]["position_m"]
+    variances = [document["tip"]["covariance_m2"][axis][axis] for axis in range(3)]
+    axes = ", ".join(
+        f"{name} {1000 * value:.1f} +-{1000 * variance**0.5:.1f}"
+        for name, value, variance in zip("xyz", position, variances, strict=True)
+    )
+    return (
+        f"{path.stem}: tip at {axes} mm in the hand frame "
+        f"({document['method']}, {document['frames_used']} frames)"
+    )

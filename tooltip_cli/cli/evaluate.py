@@ -1,0 +1,213 @@
+"""``tooltip evaluate``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from tooltip_cli.cli.options import (
+    PATH,
+    force_option,
+    jobs_option,
+    json_option,
+    print_json,
+    progress,
+    recordings_argument,
+    say,
+    topic_options,
+)
+
+if TYPE_CHECKING:
+    from tooltip_cli.method.evaluation import ErrorSummary
+    from tooltip_cli.report.model import EvaluationReport, RecordingReport
+
+EXIT_CODES = {"ok": 0, "refused": 3, "failed": 1}
+
+
+@click.command()
+@recordings_argument
+@click.option(
+    "--labels",
+    type=PATH,
+    metavar="CSV",
+    help="Labels, or a folder with STEM.labels.csv for each recording. Default: STEM.labels.csv "
+    "under --out, then beside the recording.",
+)
+@click.option(
+    "--second-labels",
+    type=PATH,
+    metavar="CSV",
+    help="A second annotator's labels of the same frames. Default: STEM.labels.*.csv.",
+)
+@click.option(
+    "--rig",
+    type=PATH,
+    help="Rig file, or a folder with STEM.rig.yaml for each recording. Default: the one stored in "
+    "the recording.",
+)
+@click.option(
+    "--method", default="kmeans", show_default=True, help="Estimator, as in 'tooltip estimate'."
+)
+@click.option(
+    "--train", type=click.IntRange(min=1), default=400, show_default=True, help="Training frames."
+)
+@click.option(
+    "--test",
+    type=click.IntRange(min=1),
+    default=100,
+    show_default=True,
+    help="Test frames, where no labels decide them.",
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the split.")
+@click.option(
+    "--split",
+    type=click.Choice(["random", "blocks"]),
+    default="random",
+    show_default=True,
+    help="random as in the paper, or contiguous test blocks, where no labels decide.",
+)
+@click.option(
+    "--curve/--no-curve",
+    default=True,
+    show_default=True,
+    help="Whether to estimate from ever fewer training frames too.",
+)
+@click.option(
+    "--out",
+    type=PATH,
+    help="Directory of the report and of whatever has to be computed. Default: report/ beside the "
+    "first recording.",
+)
+@jobs_option
+@topic_options
+@force_option
+@json_option
+@click.pass_context
+def evaluate(
+    ctx: click.Context,
+    recordings: tuple[Path, ...],
+    labels: Path | None,
+    second_labels: Path | None,
+    rig: Path | None,
+    method: str,
+    train: int,
+    test: int,
+    seed: int,
+    split: str,
+    curve: bool,
+    out: Path | None,
+    jobs: int,
+    image: str | None,
+    joints: str | None,
+    info: str | None,
+    pose: str | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Measure the estimate against hand labels and write a report.
+
+    The tip is estimated from detections in the training frames and, as a baseline, from the
+    labels; both are projected into the labelled test frames (paper, section 4). Writes index.html,
+    report.json, tools.csv, frames.csv, tools.tex and every figure as SVG, PNG and CSV. Without
+    labels the report says what can be told all the same.
+
+    Exits with 0 when at least one recording has an estimate, 3 when every estimate was refused,
+    and 1 when none could be evaluated.
+
+    \b
+    Examples:
+      tooltip evaluate pliers.mcap
+      tooltip evaluate *.mcap --out results --jobs 2
+      tooltip evaluate pen.mcap --rig pen.rig.yaml --labels pen.labels.csv
+    """
+    from tooltip_cli.log.recording import Topics
+    from tooltip_cli.method.estimators import EstimatorParams
+    from tooltip_cli.stages.artifacts import plain
+    from tooltip_cli.stages.evaluate import evaluate as run
+
+    with progress(None, "detect, pairs") as advance:
+        report = run(
+            recordings,
+            labels=labels,
+            second_labels=second_labels,
+            rig=rig,
+            topics=Topics(image=image, joints=joints, info=info, pose=pose),
+            train=train,
+            test=test,
+            seed=seed,
+            split=split,
+            params=EstimatorParams(method=method),
+            curve=curve,
+            out=out,
+            force=force,
+            jobs=jobs,
+            on_pair=advance,
+            on_step=lambda path, text: say(f"{path}: {text}"),
+        )
+    if as_json:
+        print_json(plain(report))
+    else:
+        print_summary(report)
+    ctx.exit(EXIT_CODES[report.status])
+
+
+def print_summary(report: EvaluationReport) -> None:
+    """Print the errors of every tool, aligned, and where the report is."""
+    from tooltip_cli.report.model import mean_of
+
+    header = ("tool", "detector [px]", "baseline [px]", "tip [mm]", "")
+    rows = [_cells(row) for row in report.recordings]
+    overall = report.overall
+    if overall.compared > 1:
+        mean = (
+            f"mean of {overall.compared}",
+            _error(overall.detector_px),
+            _error(overall.baseline_px),
+            _number(mean_of(overall.tip_error_mm)),
+            "",
+        )
+        rows.append(mean)
+    widths = [max(len(row[column]) for row in (header, *rows)) for column in range(4)]
+    click.secho(_line(header, widths), bold=True)
+    for row in rows:
+        click.secho(_line(row, widths), fg="yellow" if row[4] else None)
+    for found in report.recordings:
+        for text in (*(reason.text for reason in found.reasons), *found.notes):
+            say(f"{found.name}: {text}")
+    click.echo(report.page)
+
+
+def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
+    numbers = "  ".join(
+        cell.rjust(width) for cell, width in zip(cells[1:4], widths[1:], strict=True)
+    )
+    return f"{cells[0].ljust(widths[0])}  {numbers}  {cells[4]}".rstrip()
+
+
+def _cells(row: RecordingReport) -> tuple[str, str, str, str, str]:
+    codes = ", ".join(reason.code for reason in row.reasons)
+    remark = codes if row.status == "ok" else f"{row.status} ({codes})"
+    if row.labels is None and row.status == "ok":
+        remark = "no labels"
+    return (
+        row.name,
+        _error(row.detector_px),
+        _error(row.baseline_px),
+        _number(row.tip_error_mm),
+        "failed" if row.status == "failed" else remark,
+    )
+
+
+def _error(error: ErrorSummary | None) -> str:
+    if error is None:
+        return "-"
+    if error.low is None or error.high is None:
+        return f"{error.mean:.2f}"
+    return f"{error.mean:.2f} [{error.low:.2f}, {error.high:.2f}]"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"

@@ -1,0 +1,397 @@
+"""Block matching of one edge as vector instructions, and the loop over the edges around it.
+
+The sums of absolute differences (SADs) of sixteen neighbouring displacements are formed side by
+side in the 16-bit lanes of a vector. Numba's loops are not turned into such code by LLVM, so the
+part that matters is handed to LLVM as vector code (`match_edge`): portable vectors, which become
+whatever the processor has, and on x86 the instruction ``mpsadbw``, which forms the SADs of four
+pixels at eight (SSE4.1) or sixteen (AVX2) displacements at once.
+
+This module imports numba; import it only where `_jit.numba_available` has said yes. The kernel and
+the vector code stay in one file because numba's cache on disk notices changes in the kernel's own
+file only.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.registry import cpu_target
+from numba.extending import intrinsic
+
+from tooltip_cli.method import _jit
+
+_PORTABLE_LANES = 16
+_BLOCK_ROWS_AT_ONCE = 55  # rows of blocks, 11 displacements of 5, in code without a loop
+
+_Image = tuple[Any, Any]  # address of a pixel, bytes from one row to the next
+_Rows = Sequence[tuple[list[Any], list[Any]]]  # quads and spare columns of rows of pixels
+
+_BYTE, _LANE, _WORD, _INDEX = (ir.IntType(bits) for bits in (8, 16, 32, 64))
+
+
+def mpsadbw_lanes() -> int:
+    """Return how many SADs one ``mpsadbw`` gives on the processor numba compiles for.
+
+    16 with AVX2, 8 with SSE4.1, 0 where there is no such instruction.
+    """
+    features = cpu_target.target_context.codegen().magic_tuple()[2].split(",")
+    if "+avx2" in features:
+        return 16
+    return 8 if "+sse4.1" in features else 0
+
+
+class _EdgeCode:
+    """Writes the vector code that matches one edge.
+
+    Of the block's columns ``mpsadbw`` takes four at a time (a quad); the spare ones, which are all
+    of them in portable code, add |a - b| = 2 max(a, b) - a - b, one instruction fewer for every
+    pixel than a difference and its absolute value. Where the last quad lacks a column (blocks of
+    3, 7, 11, 15), zeros fill it, and what they add, the second image's pixels, is subtracted as -b
+    of a spare column.
+
+    Attributes:
+        lanes: displacements side by side in one vector, of type `vector`.
+        pieces: vectors for one row of displacements.
+        quads: first columns of the quads.
+        spare: spare columns.
+    """
+
+    def __init__(self, builder: Any, block: int, search: int, mpsadbw: int) -> None:
+        self.builder, self.block, self.search = builder, block, search
+        self.lanes = mpsadbw or _PORTABLE_LANES
+        self.pieces = -(-search // self.lanes)
+        self.quads = range(0, block - 2, 4) if mpsadbw else range(0)
+        taken = 4 * len(self.quads)
+        self.spare = range(min(block, taken), max(block, taken))
+        self.vector = ir.VectorType(_LANE, self.lanes)
+
+    def at(self, pointer: Any, offset: int) -> Any:
+        return self.builder.gep(pointer, [_INDEX(offset)])
+
+    def load(self, pointer: Any, kind: Any) -> Any:
+        loaded = self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()))
+        loaded.align = 1
+        return loaded
+
+    def splat(self, scalar: Any, lanes: int) -> Any:
+        kind = ir.VectorType(scalar.type, lanes)
+        first = self.builder.insert_element(kind(ir.Undefined), scalar, _WORD(0))
+        return self.builder.shuffle_vector(first, first, ir.VectorType(_WORD, lanes)([0] * lanes))
+
+    def call(self, name: str, result: Any, *arguments: Any) -> Any:
+        kind = ir.FunctionType(result, [argument.type for argument in arguments])
+        function = cgutils.get_or_insert_function(self.builder.module, kind, name)
+        return self.builder.call(function, arguments)
+
+    def row(self, image: _Image, index: Any) -> Any:
+        return self.builder.gep(image[0], [self.builder.mul(image[1], index)])
+
+    def pick(self, extreme: str, left: Any, right: Any) -> Any:
+        return self.call(f"llvm.{extreme}.v{self.lanes}i16", self.vector, left, right)
+
+    def least_lane(self, lanes: Any) -> Any:
+        return self.call(f"llvm.vector.reduce.umin.v{self.lanes}i16", _LANE, lanes)
+
+    def constant(self, piece: int, values: Sequence[int], outside: int) -> Any:
+        """A vector of the values of those of the window's columns that `piece` covers."""
+        columns = range(piece * self.lanes, (piece + 1) * self.lanes)
+        return self.vector([int(values[x]) if x < self.search else outside for x in columns])
+
+    def block_row(self, pointer: Any) -> tuple[list[Any], list[Any]]:
+        """The quads of one row of the block, and its spare pixels, each repeated over a vector."""
+        builder, quads = self.builder, []
+        for column in self.quads:
+            start = self.at(pointer, column)
+            if column + 4 <= self.block:
+                pixels = self.load(start, _WORD)
+            else:
+                pair = builder.zext(self.load(start, _LANE), _WORD)
+                third = builder.zext(self.load(self.at(start, 2), _BYTE), _WORD)
+                pixels = builder.or_(pair, builder.shl(third, _WORD(16)))
+            row = self.splat(pixels, self.lanes // 2)
+            quads.append(builder.bitcast(row, ir.VectorType(_BYTE, 2 * self.lanes)))
+        spare = [
+            self.splat(builder.zext(self.load(self.at(pointer, column), _BYTE), _LANE), self.lanes)
+            for column in self.spare
+            if column < self.block
+        ]
+        return quads, spare
+
+    def window_row(self, pointer: Any) -> tuple[list[Any], list[Any]]:
+        """The pixels of one row of the window that meet the block's, displacement by lane."""
+        quads, half = [], ir.VectorType(_BYTE, 16)
+        for column in self.quads:
+            row = self.load(self.at(pointer, column), half)
+            if self.lanes == 16:
+                upper = self.load(self.at(pointer, column + 8), half)
+                both = ir.VectorType(_WORD, 32)(list(range(32)))
+                row = self.builder.shuffle_vector(row, upper, both)
+            quads.append(row)
+        pixels = ir.VectorType(_BYTE, self.lanes)
+        spare = [
+            self.builder.zext(self.load(self.at(pointer, column), pixels), self.vector)
+            for column in self.spare
+        ]
+        return quads, spare
+
+    def sad_rows(self, block_rows: _Rows, window_rows: _Rows) -> list[Any]:
+        """The SADs of neighbouring rows of displacements, from all rows of pixels they need."""
+        builder, zero = self.builder, self.vector([0] * self.lanes)
+        mpsadbw = "llvm.x86.avx2.mpsadbw" if self.lanes == 16 else "llvm.x86.sse41.mpsadbw"
+        count = len(window_rows) - self.block + 1
+        sums, maxima = [zero] * count, [zero] * count
+        for y, (quads, spare) in enumerate(window_rows):
+            for dv in range(max(0, y - self.block + 1), min(count, y + 1)):
+                block_quads, block_spare = block_rows[y - dv]
+                for theirs, ours in zip(quads, block_quads, strict=True):
+                    part = self.call(mpsadbw, self.vector, theirs, ours, _BYTE(0))
+                    sums[dv] = builder.add(sums[dv], part)
+                for theirs, ours in zip(spare, block_spare, strict=False):
+                    maxima[dv] = builder.add(maxima[dv], self.pick("smax", theirs, ours))
+        totals = [functools.reduce(builder.add, spare) for _, spare in window_rows]
+        taken_off = itertools.chain(*(spare for _, spare in block_rows), totals[: self.block - 1])
+        below = functools.reduce(builder.add, taken_off)
+        sads = []
+        for dv in range(count):
+            below = builder.add(below, totals[dv + self.block - 1])
+            twice = builder.add(maxima[dv], maxima[dv])
+            sads.append(builder.sub(builder.add(sums[dv], twice), below))
+            below = builder.sub(below, totals[dv])
+        return sads
+
+    def sad_map(self, block: _Image, window: _Image) -> Any:
+        """Write the SADs of all displacements into a new buffer and return its address.
+
+        The buffer holds search rows of `pieces` vectors; lanes outside the window hold 0xFFFF.
+        """
+        builder = self.builder
+        rows = min(self.search, _BLOCK_ROWS_AT_ONCE // self.block)
+        block_rows = [self.block_row(self.row(block, _INDEX(y))) for y in range(self.block)]
+        buffer = cgutils.alloca_once(builder, ir.ArrayType(self.vector, self.search * self.pieces))
+        sads = builder.bitcast(buffer, self.vector.as_pointer())
+        with cgutils.for_range(builder, _INDEX(-(-self.search // rows))) as loop:
+            # The last rows may overlap the ones before: the same numbers are written again.
+            wanted, last = builder.mul(loop.index, _INDEX(rows)), _INDEX(self.search - rows)
+            top = builder.select(builder.icmp_signed("<", wanted, last), wanted, last)
+            starts = [
+                self.row(window, builder.add(top, _INDEX(y))) for y in range(rows + self.block - 1)
+            ]
+            for piece in range(self.pieces):
+                outside = self.constant(piece, [0] * self.search, -1)
+                pixels = [self.window_row(self.at(start, piece * self.lanes)) for start in starts]
+                for dv, sad in enumerate(self.sad_rows(block_rows, pixels)):
+                    index = builder.mul(builder.add(top, _INDEX(dv)), _INDEX(self.pieces))
+                    place = builder.gep(sads, [builder.add(index, _INDEX(piece))])
+                    builder.store(builder.or_(sad, outside), place)
+        return sads
+
+    def best(self, rows: list[list[Any]], ranks: Any) -> tuple[Any, Any]:
+        """The lowest SAD and the lowest rank of the displacements that have it."""
+        builder = self.builder
+        pick_lower = functools.partial(self.pick, "umin")
+        least = self.least_lane(functools.reduce(pick_lower, itertools.chain(*rows)))
+        wanted = self.splat(least, self.lanes)
+        worst = lowest = self.vector([-1] * self.lanes)
+        for index, sad in enumerate(itertools.chain(*rows)):
+            rank = self.load(self.at(ranks, 2 * self.lanes * index), self.vector)
+            equal = builder.icmp_unsigned("==", sad, wanted)
+            lowest = pick_lower(lowest, builder.select(equal, rank, worst))
+        return least, self.least_lane(lowest)
+
+    def moments(self, rows: list[list[Any]], highest: Any) -> list[Any]:
+        """Sums over the displacements with a SAD of at most `highest`.
+
+        With x the column counted from the window's centre and k = search - row: the sums of
+        1, x, x^2, k, k x and k (k + 1) / 2. Those with k come from adding up running totals, so
+        that a row of displacements costs a comparison and three additions.
+        """
+        builder, reach = self.builder, self.search // 2
+        threshold = self.splat(highest, self.lanes)
+        wide = ir.VectorType(_WORD, self.lanes)
+        x = range(-reach, reach + 1)
+        ones, squares = [1] * self.search, [value * value for value in x]
+        sums: list[Any] = [_WORD(0)] * 6
+        for piece in range(self.pieces):
+            count = once = twice = self.vector([0] * self.lanes)
+            for row in rows:
+                similar = builder.icmp_unsigned("<=", row[piece], threshold)
+                count = builder.sub(count, builder.sext(similar, self.vector))
+                once = builder.add(once, count)
+                twice = builder.add(twice, once)
+            weighted = [(count, ones), (count, x), (count, squares), (once, ones), (once, x)]
+            for index, (lanes, values) in enumerate([*weighted, (twice, ones)]):
+                factors = builder.sext(self.constant(piece, values, 0), wide)
+                product = builder.mul(builder.zext(lanes, wide), factors)
+                total = self.call(f"llvm.vector.reduce.add.v{self.lanes}i32", _WORD, product)
+                sums[index] = builder.add(sums[index], total)
+        return sums
+
+    def match(self, block: _Image, window: _Image, ranks: Any, excess: Any) -> list[Any]:
+        """The eight numbers that `match_edge` returns."""
+        builder = self.builder
+        sads = self.sad_map(block, window)
+        rows = [
+            [self.load(self.at(sads, y * self.pieces + p), self.vector) for p in range(self.pieces)]
+            for y in range(self.search)
+        ]
+        least, rank = self.best(rows, ranks)
+        room = builder.sub(_LANE(0xFFFE), least)
+        enough = builder.icmp_unsigned("<", excess, builder.zext(room, _INDEX))
+        highest = builder.add(least, builder.select(enough, builder.trunc(excess, _LANE), room))
+        sums = [builder.sext(total, _INDEX) for total in self.moments(rows, highest)]
+        return [builder.zext(least, _INDEX), builder.zext(rank, _INDEX), *sums]
+
+
+def _match_edge(
+    _typing: Any,
+    first: Any,
+    first_stride: Any,
+    window: Any,
+    window_stride: Any,
+    ranks: Any,
+    excess: Any,
+    block: Any,
+    search: Any,
+    mpsadbw: Any,
+) -> Any:
+    """Match one edge, in numba code.
+
+    Args:
+        first: address of the block's top left pixel in the first image.
+        first_stride: bytes from one row of it to the next.
+        window: address of the search window's top left pixel in the second image.
+        window_stride: bytes from one row of it to the next.
+        ranks: address of a `rank_table`.
+        excess: how much a SAD may exceed the lowest one and still count as similar.
+        block, search, mpsadbw: the constants of `matcher`.
+
+    Returns:
+        The lowest SAD, its rank, and the six sums of `_EdgeCode.moments`.
+    """
+    constants = [constant.literal_value for constant in (block, search, mpsadbw)]
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        block_at, window_at, ranks_at = (
+            builder.inttoptr(values[index], _BYTE.as_pointer()) for index in (0, 2, 4)
+        )
+        numbers = _EdgeCode(builder, *constants).match(
+            (block_at, values[1]), (window_at, values[3]), ranks_at, values[5]
+        )
+        return context.make_tuple(builder, signature.return_type, numbers)
+
+    signature = types.UniTuple(types.int64, 8)(*[types.int64] * 6, block, search, mpsadbw)
+    return signature, generate
+
+
+match_edge = intrinsic(prefer_literal=True)(_match_edge)
+
+
+def rank_table(displacements: npt.NDArray[np.int32], mpsadbw: int) -> npt.NDArray[np.uint16]:
+    """Return the (search, lanes) ranks of the displacements, filled up to whole vectors."""
+    search = math.isqrt(len(displacements))
+    lanes = mpsadbw or _PORTABLE_LANES
+    table = np.full((search, -(-search // lanes) * lanes), 0xFFFF, np.uint16)
+    column, row = displacements.T + search // 2
+    table[row, column] = np.arange(len(displacements))
+    return table
+
+
+def row_bytes(block: int, search: int) -> int:
+    """Return how many bytes `match_edge` may read from the start of each row of a window."""
+    return search + block + 32
+
+
+_IMAGE = types.Array(types.uint8, 2, "C", readonly=True)
+_PAIRS = types.Array(types.int32, 2, "C", readonly=True)
+_SIGNATURE = types.int64(
+    _IMAGE,
+    _IMAGE,
+    _PAIRS,
+    _PAIRS,
+    types.int64,
+    types.float64,
+    _PAIRS,
+    types.uint16[:, ::1],
+    types.uint8[:, ::1],
+    types.int32[:, ::1],
+    types.int32[::1],
+    types.float64[:, ::1],
+)
+
+
+@functools.cache
+def matcher(block: int, search: int, mpsadbw: int) -> Callable[..., int]:
+    """Return the compiled loop over the edges for one size of block and search window.
+
+    Its arguments are the two images, (N, 2) edges, (N, 2) or (0, 2) offsets, the excess of
+    `match_edge`, alpha, the (search^2, 2) displacements in the order in which ties are decided,
+    their `rank_table`, a scratch array of search + block - 1 rows of `row_bytes`, and the (N, 2),
+    (N,) and (N, 3) results to fill. It returns the index of the first edge whose block or window
+    leaves the image, or -1.
+
+    Args:
+        block: side of the blocks, pixels; odd, 3 to 15.
+        search: side of the search window, pixels; odd, 3 to 71.
+        mpsadbw: what `mpsadbw_lanes` says, or 0 for portable code.
+    """
+    half, margin = block // 2, block // 2 + search // 2
+    side, reach = 2 * margin + 1, row_bytes(block, search)
+
+    def match_all(
+        first: Any,
+        second: Any,
+        edges: Any,
+        offsets: Any,
+        excess: Any,
+        alpha: Any,
+        displacements: Any,
+        ranks: Any,
+        scratch: Any,
+        translations: Any,
+        sad: Any,
+        covariances: Any,
+    ) -> int:
+        height, width = second.shape
+        first_at, second_at = np.int64(first.ctypes.data), np.int64(second.ctypes.data)
+        scratch_at, ranks_at = np.int64(scratch.ctypes.data), np.int64(ranks.ctypes.data)
+        for i in range(edges.shape[0]):
+            u, v = np.int64(edges[i, 0]), np.int64(edges[i, 1])
+            if u < half or v < half or u >= width - half or v >= height - half:
+                return i
+            du, dv = np.int64(0), np.int64(0)
+            if offsets.shape[0] > 0:
+                du, dv = np.int64(offsets[i, 0]), np.int64(offsets[i, 1])
+            left, top = u + du - margin, v + dv - margin
+            if left < 0 or top < 0 or left + side > width or top + side > height:
+                return i
+            window, stride = second_at + top * width + left, width
+            if (top + side - 1) * width + left + reach > second.size:
+                # Vectors read beyond the window's last column; here that would leave the image.
+                for y in range(side):
+                    for x in range(side):
+                        scratch[y, x] = second[top + y, left + x]
+                window, stride = scratch_at, scratch.shape[1]
+            block_at = first_at + (v - half) * width + u - half
+            least, rank, n, x, xx, k, kx, kk = match_edge(
+                block_at, width, window, stride, ranks_at, excess, block, search, mpsadbw
+            )
+            bu, bv = np.int64(displacements[rank, 0]), np.int64(displacements[rank, 1])
+            translations[i, 0], translations[i, 1] = du + bu, dv + bv
+            sad[i] = least
+            # Scatter around the best match, in integers until the division; bk is its row's k.
+            bk = search - search // 2 - bv
+            covariances[i, 0] = alpha + (xx - 2 * bu * x + n * bu * bu) / n
+            covariances[i, 1] = (bk * x - kx + bu * k - n * bu * bk) / n
+            covariances[i, 2] = alpha + (2 * kk - k - 2 * bk * k + n * bk * bk) / n
+        return -1
+
+    return _jit.compiled(match_all, _SIGNATURE)

@@ -1,0 +1,251 @@
+"""The 3D tip from pixels in many views: the paper's section 3.2 and appendix B."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from tooltip_cli.errors import TooltipError, one_of
+from tooltip_cli.method import generative
+from tooltip_cli.method.generative import MixtureFit, Observations
+from tooltip_cli.method.kmeans import Clusters, kmeans, lloyd
+from tooltip_cli.method.rays import angular_spread, intersections, plausible
+from tooltip_cli.method.types import (
+    Array,
+    Candidate,
+    Indices,
+    Rays,
+    Reason,
+    TipEstimate,
+    refused,
+)
+
+
+@dataclass(frozen=True)
+class EstimatorParams:
+    """Constants of the estimators; defaults are the paper's where it gives them."""
+
+    method: str = "kmeans"
+    max_ray_distance: float = 0.0254  # metres (3.2: 2.54 cm)
+    max_range: float = 3.0  # metres from the hand (3.2)
+    clusters: int = 8  # k (4.3)
+    z_start: float = 0.0  # metres; not in the paper
+    seed: int = 0  # of K-means' start; not in the paper
+    sigma_start_px: float = 10.0  # appendix B's sigma, where the fit starts; not in the paper
+    sigma_min_px: float = 0.1  # bounds on the fitted sigma; not in the paper
+    sigma_max_px: float = 15.0
+    min_views: int = 3  # refusal below; not in the paper
+    min_view_angle_deg: float = 3.0  # refusal below; not in the paper
+    max_deviation: float = 0.05  # metres, refusal above; not in the paper
+    min_support: float = 0.05  # share of views that agree, refusal below; not in the paper
+
+
+@dataclass(frozen=True)
+class EstimationInput:
+    """Everything that an estimator sees: the tip's pixels as rays, and the hand."""
+
+    rays: Rays  # in the hand frame
+    directions_camera: Array  # (N, 3) unit vectors, optical frame
+    camera_from_hand: Array  # (N, 4, 4)
+    spheres: Array  # (S, 4) centre and radius, metres, hand frame
+    focal_px: float
+    image_area_px: float
+
+    def observations(self) -> Observations:
+        """Return the same as observations of the generative model."""
+        return Observations(
+            self.directions_camera[:, :2] / self.directions_camera[:, 2:],
+            self.camera_from_hand,
+            self.focal_px,
+            self.image_area_px,
+        )
+
+
+def estimate_tip(data: EstimationInput, params: EstimatorParams) -> TipEstimate:
+    """Estimate the tip in the hand frame with the chosen method.
+
+    Raises:
+        TooltipError: unknown method.
+    """
+    if params.method not in ESTIMATORS:
+        raise TooltipError(one_of("method", params.method, ESTIMATORS))
+    reasons = _too_little(data, params)
+    if reasons:
+        return refused(params.method, len(data.rays), *reasons)
+    return ESTIMATORS[params.method](data, params)
+
+
+def hypotheses(data: EstimationInput, params: EstimatorParams) -> tuple[Array, Indices]:
+    """Return the plausible intersections of all pairs of rays and the pairs' indices (3.2)."""
+    points, pairs = intersections(
+        data.rays, max_distance=params.max_ray_distance, z_start=params.z_start
+    )
+    keep = plausible(points, data.spheres, params.max_range)
+    return points[keep], pairs[keep]
+
+
+def estimate_kmeans(data: EstimationInput, params: EstimatorParams) -> TipEstimate:
+    """Section 3.2: cluster the pairs' intersections, take the largest cluster's mean."""
+    points, pairs = hypotheses(data, params)
+    if not len(points):
+        return refused("kmeans", len(data.rays), _inconsistent(0.0))
+    clusters = kmeans(points, params.clusters, params.seed)
+    candidates = tuple(
+        Candidate(mean, float(size / len(points)))
+        for mean, size in zip(clusters.means, clusters.sizes, strict=True)
+    )
+    covariance = _jackknife(points, pairs, clusters, data.rays.frames)
+    return _checked("kmeans", candidates, covariance, data, params)
+
+
+def estimate_map(data: EstimationInput, params: EstimatorParams) -> TipEstimate:
+    """Appendix B: the maximum of the posterior, its covariance from the curvature there."""
+    observations = data.observations()
+    fits = [
+        generative.fit_mixture(
+            observations,
+            start,
+            sigma_start_px=params.sigma_start_px,
+            sigma_min_px=params.sigma_min_px,
+            sigma_max_px=params.sigma_max_px,
+        )
+        for start in _starts(data, params)
+    ]
+    allowed = [
+        fit for fit in fits if plausible(fit.position[None], data.spheres, params.max_range)[0]
+    ]
+    if not allowed:
+        return refused("map", len(data.rays), _inconsistent(0.0))
+    ranked = _distinct(sorted(allowed, key=lambda fit: -fit.log_likelihood))
+    candidates = tuple(
+        Candidate(fit.position, float(fit.responsibilities.mean())) for fit in ranked
+    )
+    covariance = generative.curvature_covariance(observations, ranked[0])
+    return _checked("map", candidates, covariance, data, params)
+
+
+ESTIMATORS: dict[str, Callable[[EstimationInput, EstimatorParams], TipEstimate]] = {
+    "kmeans": estimate_kmeans,
+    "map": estimate_map,
+}
+
+
+def _starts(data: EstimationInput, params: EstimatorParams) -> list[Array]:
+    """Return where to start climbing: the clusters' means and the point nearest to all rays."""
+    points, _ = hypotheses(data, params)
+    starts = list(kmeans(points, params.clusters, params.seed).means) if len(points) else []
+    return [*starts, nearest_point(data.rays)]
+
+
+def nearest_point(rays: Rays) -> Array:
+    """Return the (3,) point with the least squared distance to all lines, metres."""
+    projectors = np.eye(3) - rays.directions[:, :, None] * rays.directions[:, None, :]
+    normal = projectors.sum(axis=0)
+    right = np.einsum("nij,nj->i", projectors, rays.origins)
+    point: Array = np.linalg.lstsq(normal, right, rcond=None)[0]
+    return point
+
+
+def _distinct(fits: list[MixtureFit], distance: float = 0.005) -> list[MixtureFit]:
+    """Keep the first of fits that climbed to the same place (within 5 mm)."""
+    kept: list[MixtureFit] = []
+    for fit in fits:
+        if all(np.linalg.norm(fit.position - other.position) > distance for other in kept):
+            kept.append(fit)
+    return kept
+
+
+def _jackknife(
+    points: Array, pairs: Indices, clusters: Clusters, frames: Indices, groups: int = 10
+) -> Array | None:
+    """Covariance of the largest cluster's mean from leaving out a tenth of the frames in turn.
+
+    Intersections are not independent (each ray takes part in many), so the scatter within the
+    cluster says little; leaving out frames respects that. Frames are grouped by index modulo ten.
+    """
+    member = frames % groups
+    means = []
+    for group in range(groups):
+        keep = (member[pairs] != group).all(axis=1)
+        if keep.all() or not keep.any():
+            continue
+        moved, _ = lloyd(points[keep], clusters.means)
+        means.append(moved[0])
+    if len(means) < 2:
+        return None
+    deviations = np.array(means) - np.mean(means, axis=0)
+    covariance: Array = (len(means) - 1) / len(means) * deviations.T @ deviations
+    return covariance
+
+
+def _too_little(data: EstimationInput, params: EstimatorParams) -> list[Reason]:
+    count = len(data.rays)
+    if count < params.min_views:
+        return [
+            Reason(
+                "too_few_views",
+                f"only {count} views show the tip, at least {params.min_views} are needed; record "
+                "a longer sweep",
+            )
+        ]
+    spread = np.degrees(angular_spread(data.rays.directions))
+    if spread < params.min_view_angle_deg:
+        return [
+            Reason(
+                "depth_unobservable",
+                f"seen from the hand, the views differ by only {spread:.1f} degrees, so the tip's "
+                "depth cannot be told; turn the wrist about axes across the line of sight",
+            )
+        ]
+    return []
+
+
+def _checked(
+    method: str,
+    candidates: tuple[Candidate, ...],
+    covariance: Array | None,
+    data: EstimationInput,
+    params: EstimatorParams,
+) -> TipEstimate:
+    """Return the estimate, or a refusal where it cannot be trusted."""
+    position = candidates[0].position
+    offsets = position - data.rays.origins
+    along = (offsets * data.rays.directions).sum(axis=1)
+    distances = np.linalg.norm(offsets - along[:, None] * data.rays.directions, axis=1)
+    support = float((distances <= params.max_ray_distance).mean())
+    used = len(data.rays)
+    if support < params.min_support:
+        return refused(method, used, _inconsistent(support))
+    if covariance is None:
+        return refused(
+            method,
+            used,
+            Reason(
+                "depth_unobservable",
+                "the views do not determine the tip in every direction; turn the wrist about "
+                "another axis too",
+            ),
+        )
+    deviation = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    if deviation > params.max_deviation:
+        return refused(
+            method,
+            used,
+            Reason(
+                "depth_unobservable",
+                f"the tip's worst axis has a standard deviation of {deviation * 1000:.0f} mm, more "
+                f"than {params.max_deviation * 1000:.0f} mm; turn the wrist further, and about "
+                "axes across the line of sight",
+            ),
+        )
+    return TipEstimate(method, position, covariance, candidates, (), used)
+
+
+def _inconsistent(support: float) -> Reason:
+    return Reason(
+        "inconsistent_views",
+        f"only {support:.0%} of the views agree on any one point that is fixed to the hand; check "
+        "the calibration, the clocks, and that the tool moves with the hand",
+    )

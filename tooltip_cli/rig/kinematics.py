@@ -1,0 +1,228 @@
+"""The kinematic chain from the camera to the hand, through Pinocchio."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tooltip_cli.errors import TooltipError, one_of
+
+Array = npt.NDArray[np.float64]
+
+_MAX_URDF_BYTES = 32 * 2**20
+_MAX_REACH_M = 1e6
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A camera fixed to a frame that the robot description has, at a pose that it lacks."""
+
+    parent: str  # frame name
+    xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)  # metres
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)  # radians, fixed-axis roll, pitch, yaw
+
+    @property
+    def parent_from_camera(self) -> Array:
+        """(4, 4) transform."""
+        transform = np.eye(4)
+        transform[:3, :3] = rotation_from_rpy(self.rpy)
+        transform[:3, 3] = self.xyz
+        return transform
+
+
+def rotation_from_rpy(rpy: Sequence[float]) -> Array:
+    """Return (3, 3) Rz(yaw) Ry(pitch) Rx(roll), the URDF's and REP 103's fixed-axis convention."""
+    (sr, sp, sy), (cr, cp, cy) = np.sin(rpy), np.cos(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def rotation_from_quaternion(quaternion_xyzw: npt.ArrayLike) -> Array:
+    """Return (..., 3, 3) rotations for (..., 4) quaternions (x, y, z, w) of any norm but zero."""
+    q = np.asarray(quaternion_xyzw, dtype=float)
+    x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def inverse_transform(transform: Array) -> Array:
+    """Return the inverse of (..., 4, 4) rigid transforms."""
+    rotation = np.swapaxes(transform[..., :3, :3], -1, -2)
+    inverse = np.zeros_like(transform)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, transform[..., :3, 3])
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+@dataclass(frozen=True)
+class KinematicChain:
+    """Joints between a camera and a hand, and the transform between them."""
+
+    joint_names: tuple[str, ...]  # movable joints that the transform depends on
+    _model: Any = field(repr=False)
+    _camera_frame_id: int
+    _hand_frame_id: int
+    _frame_from_camera: Array = field(repr=False)  # (4, 4); identity when the URDF has the camera
+    _columns: tuple[tuple[int, int], ...]  # per joint name: (index in q, nq)
+
+    @classmethod
+    def from_urdf(
+        cls, urdf: str, camera_frame: str, hand_frame: str, mount: Mount | None, source: str
+    ) -> KinematicChain:
+        """Build the chain from URDF text.
+
+        Args:
+            camera_frame: the optical frame; with ``mount`` only a name.
+            source: what to call the URDF in messages.
+
+        Raises:
+            TooltipError: not a URDF, a frame it lacks, or a chain that nothing moves.
+        """
+        import pinocchio
+
+        model = _build_model(pinocchio, urdf, source)
+        start = mount.parent if mount else camera_frame
+        frame_ids = []
+        for kind, name in (("camera", start), ("hand", hand_frame)):
+            # getFrameId answers an unknown name with a number, so ask first
+            body = pinocchio.FrameType.BODY
+            if not model.existFrame(name, body):
+                links = [frame.name for frame in model.frames if frame.type == body]
+                raise TooltipError(f"{source}: " + one_of(f"{kind} frame", name, links))
+            frame_ids.append(model.getFrameId(name, body))
+        names, columns = _chain_joints(model, frame_ids[0], frame_ids[1], source)
+        if not names:
+            raise TooltipError(
+                f"{source}: no movable joint lies between the frames '{start}' and "
+                f"'{hand_frame}', so the hand never moves before the camera; check the rig's "
+                "camera and hand frames"
+            )
+        fixed = mount.parent_from_camera if mount else np.eye(4)
+        chain = cls(names, model, frame_ids[0], frame_ids[1], fixed, columns)
+        transform = chain.hand_from_camera(np.full((1, len(names)), 0.5))[0]
+        rotation, translation = transform[:3, :3], transform[:3, 3]
+        # Pinocchio takes an axis of zero length as it is, which makes the rotation none
+        rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+        if not rigid or np.abs(translation).max() > _MAX_REACH_M:
+            raise TooltipError(
+                f"{source}: the transform between '{start}' and '{hand_frame}' is not rigid; one "
+                f"of the joints {', '.join(names)} has an axis or origin that no robot has"
+            )
+        return chain
+
+    def hand_from_camera(self, positions: npt.ArrayLike) -> Array:
+        """Return the transform T_c of the paper for each configuration.
+
+        Args:
+            positions: (N, J) joint positions in the order of ``joint_names``, rad or m.
+
+        Returns:
+            (N, 4, 4); NaN where a position is not finite.
+        """
+        import pinocchio
+
+        positions = np.asarray(positions, dtype=float).reshape(-1, len(self.joint_names))
+        data = self._model.createData()
+        q = pinocchio.neutral(self._model)
+        transforms = np.full((len(positions), 4, 4), np.nan)
+        for row, configuration in enumerate(positions):
+            if not np.isfinite(configuration).all():
+                continue
+            for (column, size), value in zip(self._columns, configuration, strict=True):
+                if size == 2:  # continuous joints are stored as cosine and sine
+                    q[column], q[column + 1] = np.cos(value), np.sin(value)
+                else:
+                    q[column] = value
+            pinocchio.forwardKinematics(self._model, data, q)
+            camera = pinocchio.updateFramePlacement(self._model, data, self._camera_frame_id)
+            hand = pinocchio.updateFramePlacement(self._model, data, self._hand_frame_id)
+            transforms[row] = hand.actInv(camera).homogeneous
+        return transforms @ self._frame_from_camera
+
+
+def _build_model(pinocchio: Any, urdf: str, source: str) -> Any:
+    if len(urdf) > _MAX_URDF_BYTES:
+        raise TooltipError(f"{source}: the URDF has {len(urdf)} characters, too many to be one")
+    if re.search(r"<!(DOCTYPE|ENTITY)", urdf, re.IGNORECASE):
+        raise TooltipError(f"{source}: the URDF declares a document type or entities; remove them")
+    with _captured_stderr() as captured:
+        try:
+            # Pinocchio reads bytes up to the first NUL and the declaration must be first
+            return pinocchio.buildModelFromXML(urdf.strip(), mimic=True)
+        except Exception as error:  # the C++ parser raises several unrelated types
+            detail = " ".join(f"{captured.read()} {error}".split())[:300]
+            raise TooltipError(
+                f"{source}: not a URDF that Pinocchio can read ({detail})"
+            ) from error
+
+
+class _Captured:
+    def __init__(self, file: Any) -> None:
+        self._file = file
+
+    def read(self) -> str:
+        self._file.seek(0)
+        text = self._file.read().decode("utf-8", "replace")
+        return re.sub(r"\x1b\[[0-9;]*m|at line \d+ in \S+", "", text)
+
+
+@contextmanager
+def _captured_stderr() -> Iterator[_Captured]:
+    """Catch what the C++ URDF parser prints, which would otherwise reach the terminal."""
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as file:
+        saved = os.dup(2)
+        os.dup2(file.fileno(), 2)
+        try:
+            yield _Captured(file)
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+
+
+def _chain_joints(
+    model: Any, camera_id: int, hand_id: int, source: str
+) -> tuple[tuple[str, ...], tuple[tuple[int, int], ...]]:
+    """Return names and places in q of the movable joints on one frame's way to the other."""
+    supports = [set(model.supports[model.frames[i].parentJoint]) for i in (camera_id, hand_id)]
+    names: list[str] = []
+    columns: list[tuple[int, int]] = []
+    for joint in sorted(supports[0] ^ supports[1]):
+        model_joint = model.joints[joint]
+        index = joint
+        if model_joint.nq == 0:  # a mimic joint follows another, whose place in q it names
+            index = next(
+                other
+                for other in range(1, model.njoints)
+                if model.joints[other].nq and model.joints[other].idx_q == model_joint.idx_q
+            )
+            model_joint = model.joints[index]
+        name = model.names[index]
+        if model_joint.nv != 1:
+            raise TooltipError(
+                f"{source}: joint '{name}' between camera and hand has {model_joint.nv} degrees of "
+                "freedom; only revolute, continuous and prismatic joints can be read from a log"
+            )
+        if name not in names:
+            names.append(name)
+            columns.append((model_joint.idx_q, model_joint.nq))
+    return tuple(names), tuple(columns)

@@ -1,0 +1,180 @@
+"""The detect stage: the tip's pixel in every pair of consecutive images."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from tooltip_cli.errors import TooltipError
+from tooltip_cli.log.detections import read_detections, read_provenance, write_detections
+from tooltip_cli.log.recording import Recording, Topics, read_recording
+from tooltip_cli.method.detector import (
+    Detections,
+    DetectorParams,
+    TipDetection,
+    detect_tip,
+    find_edges,
+)
+from tooltip_cli.stages.artifacts import (
+    artifact_path,
+    ensure_directory,
+    known_places,
+    provenance,
+    stage_key,
+)
+
+SUFFIX = ".detections.mcap"
+VERSION = 1
+_PAIRS_A_TASK = 32
+_LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Detected:
+    """What the stage returns: the artifact and its content."""
+
+    path: Path
+    key: str
+    reused: bool
+    detections: Detections
+
+
+def detection_key(recording: Recording, params: DetectorParams) -> str:
+    """Return the key of a recording's detections; consecutive pairs do not depend on the rig."""
+    parents = {"recording": recording.sha256, "image_topic": recording.image_topic}
+    return stage_key("detect", VERSION, parents, params)
+
+
+def detect(
+    recording_path: Path,
+    *,
+    topics: Topics | None = None,
+    params: DetectorParams | None = None,
+    out: Path | None = None,
+    force: bool = False,
+    jobs: int = 1,
+    on_pair: Callable[[], None] = lambda: None,
+) -> Detected:
+    """Find the tip's pixel in each pair of consecutive images (paper, 3.1), or reuse it.
+
+    Args:
+        out: directory for the artifact; default: beside the recording.
+        force: compute even where a fresh artifact exists.
+        jobs: threads; the result does not depend on them.
+        on_pair: called after every pair, for progress.
+
+    Raises:
+        TooltipError: the recording cannot be read, or the artifact not written.
+    """
+    recording = read_recording(recording_path, topics or Topics())
+    return detect_in(recording, params=params, out=out, force=force, jobs=jobs, on_pair=on_pair)
+
+
+def detect_in(
+    recording: Recording,
+    *,
+    params: DetectorParams | None = None,
+    out: Path | None = None,
+    force: bool = False,
+    jobs: int = 1,
+    on_pair: Callable[[], None] = lambda: None,
+) -> Detected:
+    """Do the same for a recording that is already open; see :func:`detect`."""
+    params = params or DetectorParams()
+    key = detection_key(recording, params)
+    if not force:
+        for place in known_places(recording.path, SUFFIX, out):
+            stored = _stored(place, key, recording)
+            if stored is not None:
+                return Detected(place, key, True, stored)
+    if len(recording.image_stamps_ns) < 2:
+        raise TooltipError(
+            f"{recording.path} holds a single image; detection compares consecutive images, so "
+            "record at least two" + "".join(f"; {note}" for note in recording.notes)
+        )
+    path = artifact_path(recording.path, SUFFIX, out)
+    ensure_directory(path.parent)
+    rows = []
+    for row in _detect_pairs(recording, params, jobs):
+        rows.append(row)
+        on_pair()
+    detections = _table(rows)
+    write_detections(
+        path,
+        detections,
+        recording.image_stamps_ns,
+        recording.image_frame,
+        provenance(recording.path, recording.sha256, key, params),
+    )
+    return Detected(path, key, False, detections)
+
+
+def _stored(place: Path, key: str, recording: Recording) -> Detections | None:
+    """Return the detections at a place if they have this key and are whole."""
+    origin = read_provenance(place)
+    if origin is None or origin.get("key") != key:
+        return None
+    try:
+        return read_detections(place, recording.image_stamps_ns)
+    except TooltipError:
+        _LOGGER.info("%s cannot be read and is made anew", place)
+        return None
+
+
+def _detect_pairs(
+    recording: Recording, params: DetectorParams, jobs: int
+) -> Iterator[TipDetection]:
+    """Yield detections in frame order; chunks of pairs run on threads, a few ahead."""
+    starts = iter(range(0, len(recording.image_stamps_ns) - 1, _PAIRS_A_TASK))
+    with ThreadPoolExecutor(jobs) as pool:
+
+        def submit(count: int) -> list[Future[list[TipDetection]]]:
+            return [
+                pool.submit(_detect_chunk, recording, params, start)
+                for start in islice(starts, count)
+            ]
+
+        pending = submit(jobs + 1)
+        try:
+            while pending:
+                yield from pending.pop(0).result()
+                pending += submit(1)
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+def _detect_chunk(recording: Recording, params: DetectorParams, start: int) -> list[TipDetection]:
+    stop = min(start + _PAIRS_A_TASK, len(recording.image_stamps_ns) - 1)
+    images = recording.images(range(start, stop + 1), gray=True)
+    first = next(images)
+    rows = []
+    for second in images:
+        if second.shape != first.shape:
+            raise TooltipError(
+                f"{recording.path}: the image size changes from {first.shape[1]}x{first.shape[0]} "
+                f"to {second.shape[1]}x{second.shape[0]} during the recording"
+            )
+        rows.append(detect_tip(first, second, find_edges(first, params), params))
+        first = second
+    return rows
+
+
+def _table(rows: list[TipDetection]) -> Detections:
+    frames = np.arange(len(rows))
+    return Detections(
+        frames=frames,
+        partners=frames + 1,
+        pixels=np.array([row.pixel for row in rows]).reshape(-1, 2),
+        weights=np.array([row.weight for row in rows]),
+        affines=np.array([row.affine for row in rows]).reshape(-1, 2, 3),
+        edges=np.array([row.edges for row in rows], dtype=np.int64),
+        background_edges=np.array([row.background_edges for row in rows], dtype=np.int64),
+        flags=tuple(row.flags for row in rows),
+    )

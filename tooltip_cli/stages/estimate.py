@@ -1,0 +1,264 @@
+"""The estimate stage: the 3D tip in the hand frame, from detections or hand labels."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tooltip_cli.errors import TooltipError
+from tooltip_cli.labels.files import MatchedLabels, match_labels, read_labels
+from tooltip_cli.log.recording import Recording, Topics, read_recording
+from tooltip_cli.log.views import Views, resolve_rig, resolve_views
+from tooltip_cli.method.detector import DetectorParams
+from tooltip_cli.method.estimators import EstimationInput, EstimatorParams, estimate_tip
+from tooltip_cli.method.rays import rays_in_hand, sphere_array
+from tooltip_cli.method.types import (
+    Candidate,
+    Reason,
+    TipEstimate,
+    TipPixels,
+    refused,
+)
+from tooltip_cli.rig.kinematics import inverse_transform
+from tooltip_cli.stages.artifacts import (
+    artifact_path,
+    digest,
+    known_places,
+    plain,
+    provenance,
+    read_json,
+    stage_key,
+    write_whole,
+)
+from tooltip_cli.stages.detect import Detected, detect_in
+
+SUFFIX = ".tip.json"
+LABELS_SUFFIX = ".labels.csv"
+VERSION = 1
+_LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """What the stage returns: the artifact and its content."""
+
+    path: Path
+    key: str
+    reused: bool
+    estimate: TipEstimate
+    document: dict[str, Any]  # what tip.json holds
+    detected: Detected | None  # None: from labels
+    notes: tuple[str, ...] = ()  # what was odd about the recording
+
+
+def estimate(
+    recording_path: Path,
+    *,
+    rig: Path | None = None,
+    topics: Topics | None = None,
+    params: EstimatorParams | None = None,
+    detector: DetectorParams | None = None,
+    from_labels: Path | None = None,
+    out: Path | None = None,
+    force: bool = False,
+    jobs: int = 1,
+    on_pair: Callable[[], None] = lambda: None,
+) -> Estimated:
+    """Estimate the tip of one recording and write ``STEM.tip.json``, or reuse it.
+
+    Detections that are missing or out of date are made first. Frames that hand labels exist for
+    (``STEM.labels.csv``) are left out, so that an evaluation on them stays honest.
+
+    Args:
+        rig: rig file; default: the one stored in the recording.
+        from_labels: a label file to estimate from instead of detections (the paper's baseline).
+
+    Raises:
+        TooltipError: anything wrong with the inputs.
+    """
+    recording = read_recording(recording_path, topics or Topics())
+    views = resolve_views(recording, resolve_rig(recording, rig))
+    params = params or EstimatorParams()
+    if from_labels is not None:
+        labels = match_labels(read_labels(from_labels), recording.image_stamps_ns, views.camera)
+        found = estimate_from_labels(recording, views, labels, params, out=out, force=force)
+    else:
+        held_out = labelled_frames(recording, views, out)
+        detected = detect_in(recording, params=detector, out=out, jobs=jobs, on_pair=on_pair)
+        found = estimate_from_detections(
+            recording, views, detected, params, leave_out=held_out, out=out, force=force
+        )
+    return replace(found, notes=(*recording.notes, *_unknown_poses(views)))
+
+
+def _unknown_poses(views: Views) -> list[str]:
+    unknown = int(np.count_nonzero(~views.known))
+    if not unknown:
+        return []
+    return [
+        f"the hand's pose is unknown at {unknown} of {len(views.stamps_ns)} images, which are left "
+        "out"
+    ]
+
+
+def labelled_frames(recording: Recording, views: Views, out: Path | None) -> npt.NDArray[np.intp]:
+    """Return the frames that ``STEM.labels.csv`` labels; empty where there is none."""
+    for place in known_places(recording.path, LABELS_SUFFIX, out):
+        if place.exists():
+            labels = match_labels(read_labels(place), recording.image_stamps_ns, views.camera)
+            return labels.frames
+    return np.zeros(0, dtype=np.intp)
+
+
+def estimate_from_detections(
+    recording: Recording,
+    views: Views,
+    detected: Detected,
+    params: EstimatorParams,
+    *,
+    leave_out: npt.NDArray[np.intp] | None = None,
+    only: npt.NDArray[np.intp] | None = None,
+    out: Path | None = None,
+    force: bool = False,
+) -> Estimated:
+    """Estimate from detections in ``only`` these frames, or in all but ``leave_out``."""
+    pixels = detected.detections.tip_pixels()
+    if only is not None:
+        pixels = pixels.select(np.isin(pixels.frames, only))
+    elif leave_out is not None:
+        pixels = pixels.select(~np.isin(pixels.frames, leave_out))
+    parents = {"detections": detected.key, "frames": digest(pixels.frames)}
+    found = _estimate(recording, views, pixels, parents, params, out, force)
+    return Estimated(*found, detected)
+
+
+def estimate_from_labels(
+    recording: Recording,
+    views: Views,
+    labels: MatchedLabels,
+    params: EstimatorParams,
+    *,
+    out: Path | None = None,
+    force: bool = False,
+) -> Estimated:
+    """Estimate from hand labels: the paper's baseline (4.3)."""
+    pixels = labels.visible
+    parents = {"labels": digest(pixels), "image_stamps": digest(recording.image_stamps_ns)}
+    return Estimated(*_estimate(recording, views, pixels, parents, params, out, force), None)
+
+
+def _estimate(
+    recording: Recording,
+    views: Views,
+    pixels: TipPixels,
+    parents: dict[str, str],
+    params: EstimatorParams,
+    out: Path | None,
+    force: bool,
+) -> tuple[Path, str, bool, TipEstimate, dict[str, Any]]:
+    parents = {**parents, "camera": digest(views.camera), "spheres": digest(views.spheres)}
+    parents["poses"] = digest(views.hand_from_camera)
+    key = stage_key("estimate", VERSION, parents, params)
+    if not force:
+        for place in known_places(recording.path, SUFFIX, out):
+            stored = _stored(place, key)
+            if stored is not None:
+                return place, key, True, *stored
+    result = _compute(views, pixels, params)
+    document = tip_document(result, provenance(recording.path, recording.sha256, key, params))
+    path = artifact_path(recording.path, SUFFIX, out)
+    write_whole(path, json.dumps(document, indent=1) + "\n")
+    return path, key, False, result, document
+
+
+def _stored(place: Path, key: str) -> tuple[TipEstimate, dict[str, Any]] | None:
+    """Return the estimate at a place if it has this key and is whole."""
+    document = read_json(place)
+    try:
+        if document is None or document["provenance"]["key"] != key:
+            return None
+        return estimate_from_document(document, place), document
+    except (KeyError, TypeError, TooltipError):
+        _LOGGER.info("%s cannot be read and is made anew", place)
+        return None
+
+
+def _compute(views: Views, pixels: TipPixels, params: EstimatorParams) -> TipEstimate:
+    if not len(pixels.frames):
+        reason = Reason(
+            "no_motion",
+            "no frame shows anything that moves against the background; turn the wrist while "
+            "recording, slowly enough for the camera",
+        )
+        return refused(params.method, 0, reason)
+    return estimate_tip(estimation_input(views, pixels), params)
+
+
+def estimation_input(views: Views, pixels: TipPixels) -> EstimationInput:
+    """Turn pixels into rays; frames whose hand pose is unknown are left out."""
+    directions = views.camera.directions(pixels.pixels)
+    usable = views.known[pixels.frames] & np.isfinite(directions).all(axis=1)
+    pixels, directions = pixels.select(usable), directions[usable]
+    transforms = views.hand_from_camera[pixels.frames]
+    camera = views.camera
+    return EstimationInput(
+        rays_in_hand(pixels.frames, directions, transforms),
+        directions,
+        inverse_transform(transforms),
+        sphere_array([(sphere.center, sphere.radius) for sphere in views.spheres]),
+        float(np.sqrt(camera.fx * camera.fy)),
+        float(camera.width * camera.height),
+    )
+
+
+def tip_document(result: TipEstimate, origin: dict[str, Any]) -> dict[str, Any]:
+    """Return what ``tip.json`` holds."""
+    tip = {
+        "frame": "hand",
+        "position_m": plain(result.position),
+        "covariance_m2": plain(result.covariance),
+    }
+    candidates = [
+        {"position_m": plain(item.position), "support": item.support} for item in result.candidates
+    ]
+    return {
+        "status": result.status,
+        "tip": None if result.position is None else tip,
+        "candidates": candidates,
+        "reasons": [{"code": reason.code, "text": reason.text} for reason in result.reasons],
+        "method": result.method,
+        "frames_used": result.frames_used,
+        "provenance": origin,
+    }
+
+
+def estimate_from_document(document: dict[str, Any], path: Path) -> TipEstimate:
+    """Read a ``tip.json`` back.
+
+    Raises:
+        TooltipError: it is not one.
+    """
+    try:
+        tip = document["tip"]
+        return TipEstimate(
+            method=str(document["method"]),
+            position=None if tip is None else np.array(tip["position_m"], dtype=float),
+            covariance=None if tip is None else np.array(tip["covariance_m2"], dtype=float),
+            candidates=tuple(
+                Candidate(np.array(item["position_m"], dtype=float), float(item["support"]))
+                for item in document["candidates"]
+            ),
+            reasons=tuple(Reason(item["code"], item["text"]) for item in document["reasons"]),
+            frames_used=int(document["frames_used"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise TooltipError(
+            f"{path} is not a tip file ({error!r}); --force makes it anew"
+        ) from error

@@ -1,0 +1,267 @@
+"""What one recording's row of the report is made of: errors, their shares, the training curve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tooltip_cli.errors import TooltipError
+from tooltip_cli.labels.files import MatchedLabels
+from tooltip_cli.log.recording import Recording
+from tooltip_cli.log.views import Views, resolve_views
+from tooltip_cli.method.detector import DetectorParams
+from tooltip_cli.method.estimators import EstimatorParams, estimate_tip
+from tooltip_cli.method.evaluation import Split, fit_clock, pixel_errors
+from tooltip_cli.method.types import Array, Indices, TipEstimate
+from tooltip_cli.report.model import (
+    ErrorShares,
+    EstimateScore,
+    FrameTable,
+    LabelSet,
+    RecordingReport,
+    SplitUsed,
+    TrainingPoint,
+)
+from tooltip_cli.report.scoring import (
+    Truth,
+    frame_table,
+    project_tip,
+    score_detections,
+    score_estimate,
+    vector,
+)
+from tooltip_cli.rig.rigfile import Rig
+from tooltip_cli.stages.artifacts import digest, plain, provenance
+from tooltip_cli.stages.detect import Detected
+from tooltip_cli.stages.estimate import Estimated, estimation_input
+
+TRAINING_CURVE = {10: 5, 25: 5, 50: 5, 100: 2, 200: 1, 400: 1}
+"""Sizes of the training curve and how many subsets of each: large ones are costly and alike."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How recordings are split and estimated; everything that a number may depend on."""
+
+    train: int = 400  # frames (4.1)
+    test: int = 100  # frames (4.1); where labels exist, the labelled frames
+    seed: int = 0
+    split: str = "random"  # or blocks: contiguous test blocks
+    params: EstimatorParams = field(default_factory=EstimatorParams)
+    detector: DetectorParams = field(default_factory=DetectorParams)
+    curve: bool = True  # whether to estimate from fewer training frames too
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """The labels of one recording."""
+
+    path: Path
+    labels: MatchedLabels
+    states: Mapping[int, str]  # of the labelled frames, by image index
+    described: LabelSet  # the second annotator's among them
+
+
+@dataclass(frozen=True)
+class Case:
+    """Everything about one recording that its row is made from."""
+
+    recording: Recording
+    rig: Rig
+    views: Views
+    labelled: Labelled | None
+    split: Split
+    detected: Detected
+    found: Mapping[str, Estimated]  # detections, and labels where they show the tip
+    truth: Truth | None
+    protocol: Protocol
+    key: str
+
+
+def measure(case: Case, report_dir: Path) -> tuple[RecordingReport, FrameTable]:
+    """Return one recording's row, and its test frames."""
+    recording, views, labelled = case.recording, case.views, case.labelled
+    tips = {name: item.estimate.position for name, item in case.found.items()}
+    table = frame_table(
+        views,
+        case.split.test,
+        {} if labelled is None else labelled.states,
+        None if labelled is None else labelled.labels,
+        case.detected.detections,
+        tips,
+        case.truth,
+    )
+    detector = _score(case, "detections", table, report_dir)
+    baseline = _score(case, "labels", table, report_dir) if "labels" in case.found else None
+    stamps = recording.image_stamps_ns
+    pose_known = views.known[case.split.test]
+    split = case.split
+    row = RecordingReport(
+        name=recording.path.stem,
+        recording=str(recording.path),
+        sha256=recording.sha256,
+        status=detector.status,
+        reasons=detector.reasons,
+        notes=_notes(case, int((~pose_known).sum())),
+        frames=len(stamps),
+        duration_s=float(stamps[-1] - stamps[0]) * 1e-9,
+        image_size=(views.camera.width, views.camera.height),
+        scored=int((np.isfinite(table.label).all(axis=1) & pose_known).sum()),
+        split=SplitUsed(split.kind, split.seed, len(split.train), len(split.test)),
+        labels=None if labelled is None else labelled.described,
+        truth_m=None if case.truth is None else vector(case.truth.tip_hand),
+        apart_mm=_apart_mm(tips),
+        detection=score_detections(case.detected.detections, table),
+        detector=detector,
+        baseline=baseline,
+        shares=_shares(case, table),
+        training=tuple(_training_curve(case, table)),
+        provenance=_provenance(case),
+    )
+    return row, table
+
+
+def _score(case: Case, source: str, table: FrameTable, report_dir: Path) -> EstimateScore:
+    item = case.found[source]
+    path = item.path
+    place = path.relative_to(report_dir) if path.is_relative_to(report_dir) else path
+    return score_estimate(
+        source, item.estimate, item.document, case.views, table, case.truth, str(place)
+    )
+
+
+def _apart_mm(tips: Mapping[str, Array | None]) -> float | None:
+    ours, baseline = tips.get("detections"), tips.get("labels")
+    if ours is None or baseline is None:
+        return None
+    return float(1000 * np.linalg.norm(ours - baseline))
+
+
+def _provenance(case: Case) -> dict[str, Any]:
+    recording = case.recording
+    origin = provenance(recording.path, recording.sha256, case.key, case.protocol)
+    origin["detections_key"] = case.detected.key
+    origin["split_digest"] = digest(case.split)
+    origin["rig"] = {
+        "source": case.rig.source,
+        "hand_frame": case.rig.hand_frame,
+        "camera": plain(case.views.camera),
+        "time_offset_s": case.rig.time_offset_s,
+        "poses_digest": digest(case.views.hand_from_camera),
+    }
+    return origin
+
+
+def _notes(case: Case, without_pose: int) -> tuple[str, ...]:
+    notes = [*case.recording.notes, *case.split.notes]
+    if without_pose:
+        notes.append(f"in {without_pose} test frames the hand's pose is unknown; they do not count")
+    if case.labelled is None:
+        notes.append(
+            "no labels, so the error in pixels is unknown; all that can be told is whether "
+            "detections in held-out frames agree with the estimate, and they would also agree on "
+            "a wrong point that moves with the hand. Label the test frames with: tooltip label "
+            f"{case.recording.path.name}"
+        )
+        return tuple(notes)
+    described = case.labelled.described
+    if described.simulated:
+        notes.append("the labels are simulated, not placed by a person")
+    if not described.visible:
+        notes.append("no label shows the tip, so there is no error in pixels and no baseline")
+    return tuple(notes)
+
+
+def _clock_projection(case: Case, frames: Indices) -> Callable[[Array, float], Array]:
+    """Return the projection of a tip into frames whose stamps are shifted by an offset."""
+    clipped = replace(case.recording, image_stamps_ns=case.recording.image_stamps_ns[frames])
+    places = np.arange(len(frames))
+    known: dict[float, Views | None] = {}
+
+    def project(tip: Array, offset_s: float) -> Array:
+        if offset_s not in known:
+            shifted = replace(case.rig, time_offset_s=case.rig.time_offset_s + offset_s)
+            try:
+                known[offset_s] = resolve_views(clipped, shifted)
+            except TooltipError:  # still views: no pose is known between them
+                known[offset_s] = None
+        views = known[offset_s]
+        if views is None:
+            return np.full((len(frames), 2), np.nan)
+        return project_tip(views, tip, places)
+
+    return project
+
+
+def _shares(case: Case, table: FrameTable) -> ErrorShares | None:
+    """Attribute the mean error to detection, to the clocks, and to calibration and labels."""
+    labels = case.found.get("labels")
+    prediction, baseline = table.prediction_error_px, table.baseline_error_px
+    if labels is None or labels.estimate.position is None or not np.isfinite(prediction).any():
+        return None
+    scored = np.isfinite(baseline)
+    project = _clock_projection(case, table.frames[scored])
+    fit = fit_clock(project, table.label[scored], labels.estimate.position)
+    total, residual = float(np.nanmean(prediction)), float(np.nanmean(baseline))
+    shown = fit is not None and fit.shown
+    clock = min(fit.error_without_px - fit.error_px, residual) if fit and shown else 0.0
+    noise = pixel_errors(table.truth, table.label)
+    return ErrorShares(
+        total_px=total,
+        detection_px=total - residual,
+        clock_px=clock,
+        calibration_px=residual - clock,
+        clock_offset_ms=None if fit is None else 1000 * fit.offset_s,
+        clock_deviation_ms=None if fit is None else 1000 * fit.deviation_s,
+        clock_shown=shown,
+        label_noise_px=float(np.nanmean(noise)) if np.isfinite(noise).any() else None,
+    )
+
+
+def _training_curve(case: Case, table: FrameTable) -> list[TrainingPoint]:
+    """Estimate from ever more of the training frames, drawn at random (4.4: are 400 too many?)."""
+    if not case.protocol.curve:
+        return []
+    final = case.found["detections"].estimate
+    pixels = case.detected.detections.tip_pixels()
+    train = case.split.train[np.isin(case.split.train, pixels.frames)]
+    rng = np.random.default_rng(case.protocol.seed)
+    points = []
+    for size in (size for size in TRAINING_CURVE if size < len(train)):
+        subsets = [rng.permutation(train)[:size] for _ in range(TRAINING_CURVE[size])]
+        estimates = [
+            estimate_tip(
+                estimation_input(case.views, pixels.select(np.isin(pixels.frames, subset))),
+                case.protocol.params,
+            )
+            for subset in subsets
+        ]
+        points.append(_training_point(size, estimates, final, case.views, table))
+    return [*points, _training_point(len(train), [final], final, case.views, table)]
+
+
+def _training_point(
+    size: int,
+    estimates: Sequence[TipEstimate],
+    final: TipEstimate,
+    views: Views,
+    table: FrameTable,
+) -> TrainingPoint:
+    tips = [item.position for item in estimates if item.position is not None]
+    errors = [pixel_errors(project_tip(views, tip, table.frames), table.label) for tip in tips]
+    means = [float(np.nanmean(error)) for error in errors if np.isfinite(error).any()]
+    goal = final.position
+    shifts = [] if goal is None else [float(np.linalg.norm(tip - goal)) for tip in tips]
+    return TrainingPoint(
+        frames=size,
+        repeats=len(estimates),
+        refused=len(estimates) - len(tips),
+        error_px=float(np.mean(means)) if means else None,
+        low_px=min(means) if means else None,
+        high_px=max(means) if means else None,
+        shift_mm=float(1000 * np.mean(shifts)) if shifts else None,
+    )
