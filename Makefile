@@ -18,7 +18,7 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $@
 
 demo: install
-	$(BIN)/tooltip demo $(DEMO) --tools $(TOOLS) --jobs 2 --force
+	$(BIN)/tooltip demo $(DEMO) --tools $(TOOLS) --jobs 2
 
 test: install
 	$(BIN)/python -m pytest -n 2
@@ -28,10 +28,11 @@ lint: install
 	$(BIN)/ruff format --check .
 
 types: install
-	$(BIN)/mypy
+	$(BIN)/mypy tooltip_cli tests docs
 
 docs: install
 	$(BIN)/python docs/make_cli_reference.py
+	$(BIN)/python docs/make_parameter_tables.py
 
 clean:
 	rm -rf $(VENV) demo .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -420,10 +420,20 @@ def test_kernels_compile_without_a_cache_folder() -> None:
     assert _jit.compiled(names["double"], types.int64(types.int64))(21) == 42
 
 
-def test_absence_of_numba_is_said_once(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(
+    ("without", "said"),
+    [
+        pytest.param("import", "numba cannot be imported", id="absent"),
+        pytest.param("compiler", "NUMBA_DISABLE_JIT", id="off", marks=needs_numba),
+    ],
+)
+def test_slow_numpy_is_announced_once(
+    without: str, said: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setitem(sys.modules, "numba", None)
+    if without == "import":
+        monkeypatch.setitem(sys.modules, "numba", None)
+    else:
+        monkeypatch.setattr("numba.config.DISABLE_JIT", 1)
     _jit.numba_available.cache_clear()
     try:
         first, second = image_pair("texture", 1, (40, 40))
@@ -436,7 +446,7 @@ def test_absence_of_numba_is_said_once(
         _jit.numba_available.cache_clear()
     warnings = [record for record in caplog.records if record.name == _jit.__name__]
     assert len(warnings) == 1
-    assert "numba cannot be imported" in warnings[0].getMessage()
+    assert said in warnings[0].getMessage()
 
 
 @needs_numba

@@ -54,7 +54,8 @@ def test_the_midpoint_is_nearest_to_both_rays(o1: Array, d1: Array, o2: Array, d
     """The point with the least sum of squared distances to two lines, by its normal equations."""
     assume(abs(d1 @ d2) < 0.99)
     a1, a2 = closest_points(o1, d1, o2, d2)
-    assume(min(a1, a2) > 1e-6)
+    assume(min(abs(a1), abs(a2)) > 1e-6)
+    d1, d2 = d1 * np.sign(a1), d2 * np.sign(a2)  # both rays look towards their meeting point
     found, pairs = intersections(rays_of(np.stack([o1, o2]), np.stack([d1, d2])), max_distance=1e9)
     across = [np.eye(3) - np.outer(d, d) for d in (d1, d2)]
     nearest = np.linalg.solve(across[0] + across[1], across[0] @ o1 + across[1] @ o2)

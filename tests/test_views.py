@@ -391,3 +391,13 @@ def test_irrelevant_topics_do_not_matter(tmp_path: Path) -> None:
         Message(f"{JOINT_TOPIC}_text", messages.STRING, START_NS, messages.string("")),
     ]
     assert_true_poses(views_of(tmp_path, parts))
+
+
+def test_a_mapped_name_no_longer_stands_for_itself(tmp_path: Path) -> None:
+    parts = wrist_parts(4)
+    parts["joints"] = [
+        joint_message(stamp, JOINTS[1:], angles(stamp)[1:])
+        for stamp in range(START_NS, stamp_of(6), 10_000_000)
+    ]
+    message = refused(tmp_path, parts, replace(RIG, joints={JOINTS[1]: JOINTS[0]}))
+    assert f"lacks {JOINTS[1]}, which lie between camera and hand" in message

@@ -28,7 +28,7 @@ class MissingExtraError(TooltipError):
 
 
 class DamagedLogError(TooltipError):
-    """An MCAP file that is truncated or fails a checksum; nothing was read from the damaged part."""
+    """An MCAP file that is truncated or fails a checksum; nothing damaged was read."""
 
 
 class RefusedError(TooltipError):

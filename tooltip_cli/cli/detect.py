@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -22,16 +22,20 @@ from tooltip_cli.cli.options import (
     topic_options,
 )
 
+if TYPE_CHECKING:
+    from tooltip_cli.log.recording import Recording
+
 
 @click.command()
 @recordings_argument
 @rig_option
 @click.option(
     "--preset",
-    type=click.Choice(["paper"]),
-    default="paper",
+    type=click.Choice(["voting", "paper"]),
+    default="voting",
     show_default=True,
-    help="Parameters of the detector.",
+    help="paper: the tip's pixel in consecutive images. voting: that, and all moving edges of "
+    "frames paired by the hand's motion, which needs the rig.",
 )
 @jobs_option
 @out_option
@@ -55,12 +59,15 @@ def detect(
 
     Each pair of consecutive images gives the edge point that moves most against the background
     (paper, section 3.1). Writes STEM.detections.mcap, which opens beside the recording in a
-    viewer. Detection is two-dimensional: --rig is accepted for symmetry and changes nothing.
+    viewer; these detections do not depend on the rig. Where the rig is known, also writes
+    STEM.edges.mcap for 'tooltip estimate --method voting': the moving edges of frames that are
+    paired by how far the hand moves between them.
 
     \b
     Examples:
       tooltip detect pliers.mcap
       tooltip detect *.mcap --jobs 2 --out results
+      tooltip detect pliers.mcap --preset paper
     """
     from tooltip_cli.log.recording import Topics, read_recording
     from tooltip_cli.stages.detect import detect_in
@@ -90,8 +97,36 @@ def detect(
                 "flags": flags,
             }
         )
+        if preset == "voting":
+            if rig is None and "rig.yaml" not in recording.attachments:
+                say(f"{path}: no rig is stored or given, so only consecutive images are compared")
+            else:
+                results[-1]["edges_file"] = _detect_edges(recording, rig, out, force, jobs)
     if as_json:
         print_json(results)
     else:
         for result in results:
             click.echo(result["detections_file"])
+
+
+def _detect_edges(
+    recording: Recording, rig: Path | None, out: Path | None, force: bool, jobs: int
+) -> str | None:
+    """Find the moving edges; returns their file, or None where the motion shows nothing."""
+    from tooltip_cli.log.views import resolve_rig, resolve_views
+    from tooltip_cli.method.types import Reason
+    from tooltip_cli.method.voting.params import VotingSettings
+    from tooltip_cli.stages.voting import detect_for_voting
+
+    path = recording.path
+    views = resolve_views(recording, resolve_rig(recording, rig))
+    with progress(None, f"moving edges {path.name}, frames") as advance:
+        found = detect_for_voting(
+            recording, views, VotingSettings(), out=out, force=force, jobs=jobs, on_frame=advance
+        )
+    if isinstance(found, Reason):
+        say(f"{path}: no moving edges: {found.code}: {found.text}")
+        return None
+    how = "reused" if found.reused else "computed"
+    say(f"{path}: {how} moving edges of {len(found.edges.frames)} frames in {found.path}")
+    return str(found.path)

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from tooltip_cli.cli.options import (
+    METHODS,
     PATH,
     check_names,
     force_option,
@@ -22,8 +23,6 @@ from tooltip_cli.cli.options import (
     topic_options,
 )
 
-METHODS = ("kmeans", "map")
-
 
 @click.command()
 @recordings_argument
@@ -31,9 +30,10 @@ METHODS = ("kmeans", "map")
 @click.option(
     "--method",
     type=click.Choice(METHODS),
-    default="kmeans",
+    default="voting",
     show_default=True,
-    help="kmeans: the paper's section 3.2. map: its appendix B.",
+    help="voting: all moving edges vote in a volume fixed to the hand. kmeans: the paper's section "
+    "3.2. map: its appendix B. From labels, voting is map.",
 )
 @click.option(
     "--from-labels",
@@ -64,8 +64,8 @@ def estimate(
 ) -> None:
     """Find the 3D tip in the hand frame.
 
-    Uses the detections of 'tooltip detect', making them first where they are missing or out of
-    date, and the robot's kinematics. Writes STEM.tip.json. Exits with 3 when the answer cannot be
+    Uses what 'tooltip detect' finds, making it first where it is missing or out of date, and the
+    robot's kinematics. Writes STEM.tip.json. Exits with 3 when the answer cannot be
     trusted; the file then says why.
 
     \b

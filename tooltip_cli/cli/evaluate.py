@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tooltip_cli.cli.options import (
+    METHODS,
     PATH,
     force_option,
     jobs_option,
@@ -49,7 +50,11 @@ EXIT_CODES = {"ok": 0, "refused": 3, "failed": 1}
     "the recording.",
 )
 @click.option(
-    "--method", default="kmeans", show_default=True, help="Estimator, as in 'tooltip estimate'."
+    "--method",
+    type=click.Choice(METHODS),
+    default="voting",
+    show_default=True,
+    help="Estimator, as in 'tooltip estimate'.",
 )
 @click.option(
     "--train", type=click.IntRange(min=1), default=400, show_default=True, help="Training frames."
@@ -71,9 +76,16 @@ EXIT_CODES = {"ok": 0, "refused": 3, "failed": 1}
 )
 @click.option(
     "--curve/--no-curve",
-    default=True,
-    show_default=True,
-    help="Whether to estimate from ever fewer training frames too.",
+    default=None,
+    help="Whether to estimate from ever fewer training frames too. Default: with kmeans and map, "
+    "where that is quick.",
+)
+@click.option(
+    "--frame",
+    type=click.IntRange(min=0),
+    metavar="N",
+    help="Show the test frame nearest to this image in the figures. Default: one with a typical "
+    "error.",
 )
 @click.option(
     "--out",
@@ -97,7 +109,8 @@ def evaluate(
     test: int,
     seed: int,
     split: str,
-    curve: bool,
+    curve: bool | None,
+    frame: int | None,
     out: Path | None,
     jobs: int,
     image: str | None,
@@ -141,6 +154,7 @@ def evaluate(
             split=split,
             params=EstimatorParams(method=method),
             curve=curve,
+            frame=frame,
             out=out,
             force=force,
             jobs=jobs,
@@ -190,6 +204,8 @@ def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
 def _cells(row: RecordingReport) -> tuple[str, str, str, str, str]:
     codes = ", ".join(reason.code for reason in row.reasons)
     remark = codes if row.status == "ok" else f"{row.status} ({codes})"
+    if row.detector is not None and row.detector.nearest_px is not None:
+        remark += f", nearest candidate {row.detector.nearest_px:.2f} px"
     if row.labels is None and row.status == "ok":
         remark = "no labels"
     return (

@@ -17,8 +17,9 @@ from tooltip_cli.errors import TooltipError
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 PATH = click.Path(path_type=Path)
+METHODS = ("voting", "kmeans", "map")
 _PATIENCE_S = 1.0
-_RESULT = ".detections.mcap"
+_RESULTS = (".detections.mcap", ".edges.mcap")
 
 
 def recordings_argument(command: _Command) -> _Command:
@@ -34,8 +35,8 @@ def recordings_argument(command: _Command) -> _Command:
 
 
 def _without_results(paths: tuple[Path, ...]) -> tuple[Path, ...]:
-    """Leave out detections, so that ``*.mcap`` still means the recordings they lie beside."""
-    kept = tuple(path for path in paths if not path.name.endswith(_RESULT))
+    """Leave out our own results, so that ``*.mcap`` still means the recordings beside them."""
+    kept = tuple(path for path in paths if not path.name.endswith(_RESULTS))
     return kept or paths
 
 

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from tooltip_cli.cli.options import PATH, jobs_option, print_json, progress, say, topic_options
-from tooltip_cli.errors import TooltipError
 
 if TYPE_CHECKING:
     from tooltip_cli.rig.rigfile import Rig
-    from tooltip_cli.sources.base import Source
+    from tooltip_cli.sources.base import Source, SourceReport
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -129,13 +128,9 @@ def sim(
       tooltip record sim pliers.mcap --tool pliers
       tooltip record sim pen.mcap --tool pen --frames 200 --seed 7 --size 320x240
     """
-    from tooltip_cli.labels.files import write_labels
     from tooltip_cli.sources.sim import SimParams
-    from tooltip_cli.sources.simulated import SimSource
+    from tooltip_cli.stages.simulate import record_simulation
 
-    labels = out.with_name(f"{out.stem}.labels.csv")
-    if labels.exists() and not force:
-        raise TooltipError(f"{labels} exists; give another name, or --force to replace it")
     params = SimParams(
         tool=tool,
         frames=frames,
@@ -148,11 +143,11 @@ def sim(
         motion=motion,
         background=background,
     )
-    source = SimSource(params, jobs)
-    document = _record(source, out, force)
-    write_labels(labels, source.labels())
-    say(f"{labels}: simulated labels of the test frames")
-    _finish({**document, "labels": str(labels)}, as_json)
+    with progress(frames, f"record {out.name}") as advance:
+        done = record_simulation(params, out, jobs=jobs, overwrite=force, on_image=advance)
+    document = _tell(out, done.report)
+    say(f"{done.labels}: simulated labels of the test frames")
+    _finish({**document, "labels": str(done.labels)}, as_json)
 
 
 @record.command("bag", short_help="Import ROS 1 and ROS 2 bags and other MCAP files.")
@@ -323,15 +318,21 @@ def _record(source: Source, out: Path, force: bool) -> dict[str, Any]:
 
     with progress(source.frames, f"record {out.name}") as advance:
         report = write(source, out, overwrite=force, on_image=advance).report
+    document = _tell(out, report)
+    described = any(topic.endswith("robot_description") for topic in report.read)
+    if source.rig is not None and source.rig.pose_topic is None and not described:
+        say(f"{out}: holds no robot description; give --robot, or name it in the rig file")
+    return document
+
+
+def _tell(out: Path, report: SourceReport) -> dict[str, Any]:
+    """Say what was read and left out, and return the result."""
     read = ", ".join(f"{count} {topic}" for topic, count in sorted(report.read.items()))
     say(f"{out}: {read}")
     for reason, count in sorted(report.dropped.items()):
         say(f"{out}: left out {count} {reason}")
     for note in report.notes:
         say(f"{out}: {note}")
-    described = any(topic.endswith("robot_description") for topic in report.read)
-    if source.rig is not None and source.rig.pose_topic is None and not described:
-        say(f"{out}: holds no robot description; give --robot, or name it in the rig file")
     return {
         "recording": str(out),
         "read": report.read,

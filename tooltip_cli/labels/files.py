@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tooltip_cli.errors import TooltipError, one_of
+from tooltip_cli.log.whole import write_file
 from tooltip_cli.method.types import TipPixels
 from tooltip_cli.rig.camera import CameraModel
 
@@ -126,13 +126,7 @@ def write_labels(path: Path, labels: TipLabels) -> None:
     for stamp, (u, v), state, labeler in rows:
         pixel = (f"{u:.2f}", f"{v:.2f}") if state == "visible" else ("", "")
         writer.writerow([int(stamp), *pixel, state, labeler])
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        temporary.write_text(out.getvalue(), encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise TooltipError(f"{path}: cannot be written ({error.strerror})") from error
+    write_file(path, out.getvalue())
 
 
 def match_labels(

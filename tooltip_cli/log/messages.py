@@ -26,6 +26,7 @@ POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 STRING = "std_msgs/msg/String"
 IMAGE_ANNOTATIONS = "foxglove_msgs/msg/ImageAnnotations"
 TIP_DETECTION = "tooltip_msgs/msg/TipDetection"
+MOVING_EDGES = "tooltip_msgs/msg/MovingEdges"
 
 _PRIMITIVE = re.compile(r"^(bool|byte|char|w?string|float(32|64)|u?int(8|16|32|64))\b")
 _SEPARATOR = "=" * 80

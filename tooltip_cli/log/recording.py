@@ -81,20 +81,26 @@ class Recording:
     _places: tuple[tuple[int, int, int], ...] = field(repr=False)  # chunk, offset, length
 
     def images(self, indices: Iterable[int], *, gray: bool = False) -> Iterator[Image]:
-        """Yield decoded images by index, (H, W, 3) BGR or (H, W) gray, uint8.
+        """Yield decoded images by index, (H, W, 3) BGR or (H, W) gray, uint8, of one size.
 
         Memory: one image and a few chunks. Ascending indices read the file once.
 
         Raises:
-            TooltipError: an image that cannot be decoded.
+            TooltipError: an image that cannot be decoded, or of another size than the first.
         """
         chosen = list(indices)
+        decode = decode_raw if self.image_type == messages.IMAGE else decode_compressed
+        size: tuple[int, int] | None = None
         for index, message in zip(chosen, self.image_messages(chosen), strict=True):
-            source = f"{self.path}: image {index}"
-            if self.image_type == messages.IMAGE:
-                yield decode_raw(message, gray, source)
-            else:
-                yield decode_compressed(message, gray, source)
+            image = decode(message, gray, f"{self.path}: image {index}")
+            height, width = image.shape[:2]
+            if size not in (None, (width, height)):
+                raise TooltipError(
+                    f"{self.path}: the image size changes to {width}x{height} at image {index}; "
+                    "record each resolution on its own"
+                )
+            size = (width, height)
+            yield image
 
     def image_messages(self, indices: Iterable[int]) -> Iterator[Any]:
         """Yield the messages of images as logged, CompressedImage or Image by ``image_type``.

@@ -18,20 +18,24 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 @functools.cache
 def numba_available() -> bool:
-    """Return whether numba can be imported; says once, as a warning, that it cannot.
+    """Return whether numba can compile; says once, as a warning, that it cannot.
 
     Importing numba takes about 0.2 s, which is why nothing imports it before it is needed.
     """
     try:
-        import numba  # noqa: F401  (whether this works is the question)
+        import numba
     except ImportError as error:
-        _LOGGER.warning(
-            "numba cannot be imported (%s): block matching falls back to plain numpy, "
-            "which gives the same answers about a hundred times slower",
-            error,
-        )
-        return False
-    return True
+        obstacle = f"numba cannot be imported ({error})"
+    else:
+        if not numba.config.DISABLE_JIT:
+            return True
+        obstacle = "numba's compiler is switched off (NUMBA_DISABLE_JIT)"
+    _LOGGER.warning(
+        "%s: the detector falls back to plain numpy, which gives the same answers about a "
+        "hundred times slower",
+        obstacle,
+    )
+    return False
 
 
 def compiled(function: _Function, signature: Any) -> _Function:

@@ -30,7 +30,7 @@ class DetectorParams:
     canny_low: float = 50.0  # not in the paper
     canny_high: float = 150.0  # not in the paper
     drop_iterations: int = 6  # not in the paper
-    drop_fraction: float = 0.1  # of the remaining edges, each time; not in the paper
+    drop_fraction: float = 0.2  # of the remaining edges, each time; not in the paper
     min_edges: int = 20  # fewer are flagged; not in the paper
     min_weight: float = 2.0  # lighter winners are "no motion"; not in the paper
 
@@ -40,7 +40,7 @@ class EdgeMotion:
     """The weighted edge map of a pair of images."""
 
     edges: Edges  # (N, 2) u, v in the first image, row-major order
-    translations: Array  # (N, 2) pixels
+    translations: npt.NDArray[np.int32]  # (N, 2) pixels
     covariances: Array  # (N, 3) C_uu, C_uv, C_vv, px^2
     weights: Array  # (N,) Mahalanobis distance to the background motion (it has no unit)
     background: npt.NDArray[np.bool_]  # (N,) edges that the background model kept
@@ -90,9 +90,10 @@ def find_edges(image: Image, params: DetectorParams) -> Edges:
     """
     import cv2
 
-    return np.asarray(
-        cv2.findNonZero(cv2.Canny(image, params.canny_low, params.canny_high)), dtype=np.int32
-    ).reshape(-1, 2)
+    points = cv2.findNonZero(cv2.Canny(image, params.canny_low, params.canny_high))
+    if points is None:  # OpenCV's word for no edge at all, e.g. in darkness
+        return np.zeros((0, 2), dtype=np.int32)
+    return np.asarray(points, dtype=np.int32).reshape(-1, 2)
 
 
 def edge_motion(
@@ -117,10 +118,9 @@ def edge_motion(
         tau=params.tau,
         alpha=params.alpha,
     )
-    translations = matches.translations.astype(float)
     fit = fit_background(
-        edges.astype(float),
-        translations,
+        edges,
+        matches.translations,
         matches.covariances,
         iterations=params.drop_iterations,
         drop_fraction=params.drop_fraction,
@@ -128,7 +128,7 @@ def edge_motion(
     if fit is None:
         return SINGULAR
     return EdgeMotion(
-        edges, translations, matches.covariances, fit.distances, fit.inliers, fit.model
+        edges, matches.translations, matches.covariances, fit.distances, fit.inliers, fit.model
     )
 
 

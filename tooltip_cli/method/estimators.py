@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,22 +16,24 @@ from tooltip_cli.method.types import (
     Array,
     Candidate,
     Indices,
+    Mask,
     Rays,
     Reason,
     TipEstimate,
     refused,
 )
+from tooltip_cli.method.voting.params import VotingSettings
 
 
 @dataclass(frozen=True)
 class EstimatorParams:
     """Constants of the estimators; defaults are the paper's where it gives them."""
 
-    method: str = "kmeans"
+    method: str = "voting"
     max_ray_distance: float = 0.0254  # metres (3.2: 2.54 cm)
     max_range: float = 3.0  # metres from the hand (3.2)
     clusters: int = 8  # k (4.3)
-    z_start: float = 0.0  # metres; not in the paper
+    z_start: float = 0.05  # metres, nothing is sharp or held nearer; not in the paper
     seed: int = 0  # of K-means' start; not in the paper
     sigma_start_px: float = 10.0  # appendix B's sigma, where the fit starts; not in the paper
     sigma_min_px: float = 0.1  # bounds on the fitted sigma; not in the paper
@@ -40,6 +42,14 @@ class EstimatorParams:
     min_view_angle_deg: float = 3.0  # refusal below; not in the paper
     max_deviation: float = 0.05  # metres, refusal above; not in the paper
     min_support: float = 0.05  # share of views that agree, refusal below; not in the paper
+    max_disagreement: float = 0.05  # of agreeing views, pixels per image side; not in the paper
+    # of the method "voting" alone; not in the paper
+    voting: VotingSettings = field(default_factory=VotingSettings)
+
+    @property
+    def relevant(self) -> object:
+        """What the chosen method depends on."""
+        return self.voting if self.method == "voting" else replace(self, voting=VotingSettings())
 
 
 @dataclass(frozen=True)
@@ -64,17 +74,20 @@ class EstimationInput:
 
 
 def estimate_tip(data: EstimationInput, params: EstimatorParams) -> TipEstimate:
-    """Estimate the tip in the hand frame with the chosen method.
+    """Estimate the tip in the hand frame from one pixel in each view.
+
+    The method ``voting`` sees more than that; given pixels alone it is ``map``.
 
     Raises:
         TooltipError: unknown method.
     """
-    if params.method not in ESTIMATORS:
-        raise TooltipError(one_of("method", params.method, ESTIMATORS))
+    if params.method not in METHODS:
+        raise TooltipError(one_of("method", params.method, METHODS))
+    method = params.method if params.method in ESTIMATORS else "map"
     reasons = _too_little(data, params)
     if reasons:
-        return refused(params.method, len(data.rays), *reasons)
-    return ESTIMATORS[params.method](data, params)
+        return refused(method, len(data.rays), *reasons)
+    return ESTIMATORS[method](data, params)
 
 
 def hypotheses(data: EstimationInput, params: EstimatorParams) -> tuple[Array, Indices]:
@@ -90,7 +103,7 @@ def estimate_kmeans(data: EstimationInput, params: EstimatorParams) -> TipEstima
     """Section 3.2: cluster the pairs' intersections, take the largest cluster's mean."""
     points, pairs = hypotheses(data, params)
     if not len(points):
-        return refused("kmeans", len(data.rays), _inconsistent(0.0))
+        return refused("kmeans", len(data.rays), _inconsistent(0, len(data.rays)))
     clusters = kmeans(points, params.clusters, params.seed)
     candidates = tuple(
         Candidate(mean, float(size / len(points)))
@@ -117,7 +130,7 @@ def estimate_map(data: EstimationInput, params: EstimatorParams) -> TipEstimate:
         fit for fit in fits if plausible(fit.position[None], data.spheres, params.max_range)[0]
     ]
     if not allowed:
-        return refused("map", len(data.rays), _inconsistent(0.0))
+        return refused("map", len(data.rays), _inconsistent(0, len(data.rays)))
     ranked = _distinct(sorted(allowed, key=lambda fit: -fit.log_likelihood))
     candidates = tuple(
         Candidate(fit.position, float(fit.responsibilities.mean())) for fit in ranked
@@ -130,6 +143,7 @@ ESTIMATORS: dict[str, Callable[[EstimationInput, EstimatorParams], TipEstimate]]
     "kmeans": estimate_kmeans,
     "map": estimate_map,
 }
+METHODS = ("voting", *ESTIMATORS)
 
 
 def _starts(data: EstimationInput, params: EstimatorParams) -> list[Array]:
@@ -191,15 +205,15 @@ def _too_little(data: EstimationInput, params: EstimatorParams) -> list[Reason]:
             )
         ]
     spread = np.degrees(angular_spread(data.rays.directions))
-    if spread < params.min_view_angle_deg:
-        return [
-            Reason(
-                "depth_unobservable",
-                f"seen from the hand, the views differ by only {spread:.1f} degrees, so the tip's "
-                "depth cannot be told; turn the wrist about axes across the line of sight",
-            )
-        ]
-    return []
+    return [_flat(spread)] if spread < params.min_view_angle_deg else []
+
+
+def _flat(angle_deg: float) -> Reason:
+    return Reason(
+        "depth_unobservable",
+        f"seen from the hand, the views differ by only {angle_deg:.1f} degrees, so the tip's depth "
+        "cannot be told; turn the wrist about axes across the line of sight",
+    )
 
 
 def _checked(
@@ -211,13 +225,18 @@ def _checked(
 ) -> TipEstimate:
     """Return the estimate, or a refusal where it cannot be trusted."""
     position = candidates[0].position
-    offsets = position - data.rays.origins
-    along = (offsets * data.rays.directions).sum(axis=1)
-    distances = np.linalg.norm(offsets - along[:, None] * data.rays.directions, axis=1)
-    support = float((distances <= params.max_ray_distance).mean())
     used = len(data.rays)
-    if support < params.min_support:
-        return refused(method, used, _inconsistent(support))
+    agree = _agree(position, data, params)
+    agreeing = int(np.count_nonzero(agree))
+    # what clutter would put around any one pixel, and a margin for having looked everywhere
+    chance = np.pi * params.max_disagreement**2 * used
+    if agreeing < max(params.min_support * used, chance + 5 * np.sqrt(chance) + 2):
+        return refused(method, used, _inconsistent(agreeing, used))
+    # where the cameras stood, free of the pixels' errors, which spread the rays too
+    lines = position - data.rays.origins[agree]
+    parallax = angular_spread(lines / np.linalg.norm(lines, axis=1, keepdims=True))
+    if np.degrees(parallax) < params.min_view_angle_deg:
+        return refused(method, used, _flat(np.degrees(parallax)))
     if covariance is None:
         return refused(
             method,
@@ -243,9 +262,24 @@ def _checked(
     return TipEstimate(method, position, covariance, candidates, (), used)
 
 
-def _inconsistent(support: float) -> Reason:
+def _agree(position: Array, data: EstimationInput, params: EstimatorParams) -> Mask:
+    """Return (N,) which views pass near a position and also show it near where they saw it.
+
+    Near the camera every ray passes near every other, and only the pixel tells; far away it is the
+    other way round.
+    """
+    offsets = position - data.rays.origins
+    along = (offsets * data.rays.directions).sum(axis=1)
+    distances = np.linalg.norm(offsets - along[:, None] * data.rays.directions, axis=1)
+    errors, _ = generative.residuals(data.observations(), position)
+    limit_px = params.max_disagreement * np.sqrt(data.image_area_px)
+    near_px = np.linalg.norm(errors, axis=1) <= limit_px
+    return np.asarray((along > params.z_start) & (distances <= params.max_ray_distance) & near_px)
+
+
+def _inconsistent(agreeing: int, used: int) -> Reason:
     return Reason(
         "inconsistent_views",
-        f"only {support:.0%} of the views agree on any one point that is fixed to the hand; check "
+        f"only {agreeing} of {used} views agree on any one point that is fixed to the hand; check "
         "the calibration, the clocks, and that the tool moves with the hand",
     )

@@ -208,12 +208,15 @@ def fit_clock(
     except np.linalg.LinAlgError:
         return None
     variance = float((bread @ (scores.T @ scores) @ bread)[3, 3])
+    error = pixel_errors(project(fitted[:3], float(fitted[3])), labelled)
+    error_without = pixel_errors(project(without[:3], 0.0), labelled)
+    both = np.isfinite(error) & np.isfinite(error_without)  # a shift may leave the joints' stream
     return ClockFit(
         fitted[:3],
         float(fitted[3]),
         float(np.sqrt(variance)),
-        float(np.nanmean(pixel_errors(project(fitted[:3], float(fitted[3])), labelled))),
-        float(np.nanmean(pixel_errors(project(without[:3], 0.0), labelled))),
+        float(error[both].mean()),
+        float(error_without[both].mean()),
     )
 
 

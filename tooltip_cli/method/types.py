@@ -47,6 +47,8 @@ class Candidate:
 
     position: Array  # (3,) metres, hand frame
     support: float  # share of the evidence that speaks for it, 0 to 1
+    covariance: Array | None = None  # (3, 3) m^2; None: not known for this place
+    axis: Array | None = None  # (3,) unit vector out of the tool's end, hand frame
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import io
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar
 
 from tooltip_cli.errors import MissingExtraError
 from tooltip_cli.report.tables import csv_text
@@ -170,10 +170,10 @@ def _matplotlib() -> Any:
     return matplotlib
 
 
-def bare(axes: Axes, grid: str) -> None:
+def bare(axes: Axes, grid: Literal["x", "y", "both"]) -> None:
     """Keep the grid along one axis only: ``x``, ``y`` or ``both``."""
     axes.grid(False)
-    axes.grid(True, axis=grid)  # type: ignore[arg-type]
+    axes.grid(True, axis=grid)
     axes.tick_params(length=0 if grid != "both" else 2.5)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from tooltip_cli.report.charts import (
 )
 from tooltip_cli.report.model import EvaluationReport, Histogram, RecordingReport
 from tooltip_cli.report.tables import number
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _MOST_BARS = 40  # more tools than this are not told apart in one chart
 _COARSE_BINS = 30
@@ -54,6 +58,7 @@ def error_by_tool(report: EvaluationReport) -> Drawing | None:
     for place, row in zip(places, rows, strict=True):
         if _error(row, "detector") is None:
             axes.text(0, place + 0.2, f" {row.status}", va="center", color=MUTED, fontsize=8)
+    axes.set_ylim(-0.5, len(rows) - 0.5)
     axes.set_yticks(places, [shortened(row.name) for row in rows])
     axes.set_xlabel("mean prediction error [px]; whiskers: 95 % interval")
     axes.set_xlim(0, 1.22 * max(_reach(row) for row in rows))
@@ -122,14 +127,14 @@ def _words(row: RecordingReport, kind: str) -> str:
     return "none" if error is None else f"{error.mean:.1f}"
 
 
-def _interval_and_value(axes: object, place: float, error: ErrorSummary | None) -> None:
+def _interval_and_value(axes: Axes, place: float, error: ErrorSummary | None) -> None:
     if error is None:
         return
     end = error.mean
     if error.low is not None and error.high is not None:
-        axes.plot([error.low, error.high], [place, place], color=INK, linewidth=0.9)  # type: ignore[attr-defined]
+        axes.plot([error.low, error.high], [place, place], color=INK, linewidth=0.9)
         end = error.high
-    axes.annotate(  # type: ignore[attr-defined]
+    axes.annotate(
         f"{error.mean:.1f}",
         (end, place),
         (3, 0),
@@ -161,6 +166,7 @@ def detection_histogram(report: EvaluationReport) -> Drawing | None:
     close.set_xlabel(f"detection error up to {_DETAIL_PX} px ({beyond} detections lie beyond)")
     for axes in (whole, close):
         axes.set_ylabel("detections")
+        axes.set_ylim(0, max(1.0, 1.05 * axes.dataLim.y1))
         axes.yaxis.get_major_locator().set_params(integer=True)
         bare(axes, "y")
     near = counts[:10].sum() / histogram.detections

@@ -21,6 +21,7 @@ from tooltip_cli.method.evaluation import ErrorSummary
 from tooltip_cli.method.types import Array, Indices, Reason
 
 SCHEMA = "tooltip-report/1"
+AMBIGUOUS = "ambiguous_end"  # the reason code of an estimate with a second right answer
 Vector = tuple[float, float, float]
 _Type = TypeVar("_Type")
 
@@ -56,6 +57,17 @@ class EstimateScore:
     inside_region: bool | None  # whether the true tip lies in the 95 % ellipsoid
     artifact: str  # tip.json, relative to the report
     key: str  # of that artifact
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether several candidates are right as far as the data tell."""
+        return any(reason.code == AMBIGUOUS for reason in self.reasons)
+
+    @property
+    def nearest_px(self) -> float | None:
+        """Error of the best candidate, where several are right as far as the data tell."""
+        errors = [item.error_px for item in self.candidates if item.error_px is not None]
+        return min(errors) if self.ambiguous and errors else None
 
 
 @dataclass(frozen=True)
@@ -250,6 +262,11 @@ class FrameTable:
     def baseline_error_px(self) -> Array:
         """(T,) baseline's prediction to label."""
         return np.asarray(np.linalg.norm(self.baseline - self.label, axis=1))
+
+    @property
+    def apart_px(self) -> Array:
+        """(T,) detection to prediction, which needs no label."""
+        return np.asarray(np.linalg.norm(self.detection - self.prediction, axis=1))
 
 
 def mean_of(errors: ErrorSummary | None) -> float | None:

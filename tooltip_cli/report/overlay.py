@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -156,7 +157,7 @@ def overlay_png(image: Image, window: Window, shapes: Sequence[Shape]) -> bytes:
 
 
 def _paint(
-    cv2: object, picture: Image, window: Window, scale: float, shape: Shape, casing: bool
+    cv2: Any, picture: Image, window: Window, scale: float, shape: Shape, casing: bool
 ) -> None:
     color, extra = (_against(shape.color), 1.4) if casing else (shape.color, 0.0)
     bgr = tuple(int(color[i : i + 2], 16) for i in (5, 3, 1))
@@ -169,12 +170,12 @@ def _paint(
 
     if isinstance(shape, Line):
         ends = (fixed(shape.u1, shape.v1), fixed(shape.u2, shape.v2))
-        cv2.line(picture, *ends, bgr, thick, cv2.LINE_AA, _SHIFT)  # type: ignore[attr-defined]
+        cv2.line(picture, *ends, bgr, thick, cv2.LINE_AA, _SHIFT)
         return
     radius = round((shape.radius + (extra / 2 if shape.filled else 0)) * scale * 2**_SHIFT)
     center = fixed(shape.u, shape.v)
     thick = -1 if shape.filled else thick
-    cv2.circle(picture, center, radius, bgr, thick, cv2.LINE_AA, _SHIFT)  # type: ignore[attr-defined]
+    cv2.circle(picture, center, radius, bgr, thick, cv2.LINE_AA, _SHIFT)
 
 
 def drawing(

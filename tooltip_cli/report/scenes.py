@@ -22,6 +22,7 @@ from tooltip_cli.report.scoring import project_tip
 from tooltip_cli.report.tables import csv_text, number
 
 CROSS_PX = 40  # Figure 5: "measures 40 pixels across for scale"
+_OTHERS = "Green rings: the other candidates, which the data cannot tell apart."
 _DOT_PX = 2  # radius of the edges that move
 _COLORS = np.array(  # from slow to fast, BGR; told apart by brightness too
     [[110, 80, 50], [190, 90, 150], [110, 110, 245], [60, 190, 255], [190, 255, 255]], dtype=float
@@ -50,7 +51,7 @@ def typical(row: RecordingReport, table: FrameTable) -> int | None:
     errors = table.prediction_error_px
     middle = mean_of(row.detector_px)
     if middle is None:
-        errors = np.linalg.norm(table.detection - table.prediction, axis=1)
+        errors = table.apart_px
         middle = float(np.nanmedian(errors)) if np.isfinite(errors).any() else 0.0
     complete = np.isfinite(table.label).all(axis=1) & np.isfinite(table.detection).all(axis=1)
     for usable in (np.isfinite(errors) & complete, np.isfinite(errors)):
@@ -60,47 +61,59 @@ def typical(row: RecordingReport, table: FrameTable) -> int | None:
     return int(np.argmax(shown)) if shown.any() else None
 
 
-def scene_figures(row: RecordingReport, table: FrameTable, scene: Scene) -> Iterator[Drawing]:
-    """Yield Figure 5, Figure 1 (right) and the weighted edge map of the same typical frame."""
-    place = typical(row, table)
+def scene_figures(
+    row: RecordingReport, table: FrameTable, scene: Scene, frame: int | None = None
+) -> Iterator[Drawing]:
+    """Yield Figure 5, Figure 1 (right) and the weighted edge map of the same frame.
+
+    Args:
+        frame: image index; the test frame nearest to it is shown. Default: a typical one.
+    """
+    place = typical(row, table) if frame is None else int(np.argmin(abs(table.frames - frame)))
     if place is None:
         return
-    frame = int(table.frames[place])
-    images = list(scene.recording.images(range(frame, min(frame + 2, row.frames))))
-    yield _prediction(row, table, place, images[0])
+    first = int(table.frames[place])
+    images = list(scene.recording.images(range(first, min(first + 2, row.frames))))
+    yield _prediction(row, table, place, images[0], scene)
     yield _closeup(row, table, place, images[0], scene)
     if len(images) == 2:
         yield _edge_map(row, table, place, images, scene)
 
 
-def _prediction(row: RecordingReport, table: FrameTable, place: int, image: Image) -> Drawing:
+def _prediction(
+    row: RecordingReport, table: FrameTable, place: int, image: Image, scene: Scene
+) -> Drawing:
     scale = image.shape[1] / 640  # marks keep their weight on larger images
     mean = mean_of(row.detector_px)
     shapes: list[Shape] = []
     (u, v), (x, y) = table.prediction[place], table.label[place]
     if np.isfinite(u):
-        shapes += overlay.cross(u, v, CROSS_PX, overlay.WHITE, 1.5 * scale)
+        shapes += overlay.cross(u, v, CROSS_PX, overlay.WHITE, 2 * scale)
         if mean is not None:
-            shapes.append(Circle(u, v, mean, overlay.WHITE, 1.5 * scale))
+            shapes.append(Circle(u, v, mean, overlay.WHITE, 2 * scale))
     if np.isfinite(x):
-        shapes.append(Circle(x, y, 2.5 * scale, overlay.WHITE, filled=True))
+        shapes.append(Circle(x, y, 3 * scale, overlay.WHITE, filled=True))
     words = f"Frame {table.frames[place]}"
+    key = [f"Cross ({CROSS_PX} px across): the prediction."] if np.isfinite(u) else []
     if not np.isfinite(u):
         words += ": no prediction, the estimate was refused"
     elif mean is None:
         words += ": the prediction; without labels its error is unknown"
-    else:
+    elif np.isfinite(x):
         off = table.prediction_error_px[place]
         words += f": {off:.1f} px between prediction and label; the tool's mean is {mean:.1f} px"
+        key.append("Circle: the tool's mean error.")
+    key += ["Dot: the label."] if np.isfinite(x) else []
+    others = _others(row, table, place, scene, 5 * scale)
+    key += [_OTHERS] if others else []
     return overlay.drawing(
         f"{row.name}-prediction",
         "Example prediction",
         f"Camera image of {row.name}. {words}.",
-        f"{words}. Cross ({CROSS_PX} px across): the prediction. Circle: the tool's mean error. "
-        "Dot: the label. (Figure 5 of the paper.)",
+        " ".join([f"{words}.", *key, "(Figure 5 of the paper.)"]),
         image,
         overlay.whole(image),
-        shapes,
+        [*shapes, *others],
         _marks(table, place, {"mean_error_px": mean}),
     )
 
@@ -122,20 +135,45 @@ def _closeup(
             shapes += overlay.cross(u, v, 16 * marks, color, 1.6 * marks)
         elif np.isfinite(u):
             shapes.append(Circle(u, v, 3 * marks, color, filled=True))
+    others = _others(row, table, place, scene, 5 * marks)
     far = "" if _inside(points[2], window) else "; it lies outside this view"
     missing = "" if np.isfinite(points[2]).all() else "; there is none in this frame"
     return overlay.drawing(
         f"{row.name}-closeup",
         "Hand and tool",
         f"Magnified view of hand and tool in frame {table.frames[place]} of {row.name}, with the "
-        f"motion interest point{missing or far}, the label and the estimate.",
-        f"Frame {table.frames[place]}, magnified. Black: the motion interest point{missing or far}."
-        " White: the label. Green: the estimate. (Figure 1, right, of the paper.)",
+        f"motion interest point{missing or far}, the label and the estimate, where they exist.",
+        " ".join(
+            [
+                f"Frame {table.frames[place]}, magnified.",
+                f"Black: the motion interest point{missing or far}.",
+                *(["White: the label."] if np.isfinite(points[0]).all() else []),
+                *(["Green: the estimate."] if np.isfinite(points[1]).all() else []),
+                *([_OTHERS] if others else []),
+                "(Figure 1, right, of the paper.)",
+            ]
+        ),
         image,
         window,
-        shapes,
+        [*shapes, *others],
         _marks(table, place, {}),
     )
+
+
+def _others(
+    row: RecordingReport, table: FrameTable, place: int, scene: Scene, radius: float
+) -> list[Shape]:
+    """Return rings at the other candidates of an estimate with several right answers."""
+    if row.detector is None or not row.detector.ambiguous:
+        return []
+    frame = table.frames[place : place + 1]
+    tips = [np.array(item.position_m) for item in row.detector.candidates[1:]]
+    pixels = [project_tip(scene.views, tip, frame)[0] for tip in tips]
+    return [
+        Circle(float(u), float(v), radius, overlay.GREEN, radius / 4)
+        for u, v in pixels
+        if np.isfinite(u)
+    ]
 
 
 def _inside(point: Array, window: Window) -> bool:
@@ -221,7 +259,7 @@ def by_severity(table: FrameTable) -> list[int]:
     if not np.isfinite(errors).any():
         errors = table.detection_error_px
     if not np.isfinite(errors).any():
-        errors = np.linalg.norm(table.detection - table.prediction, axis=1)
+        errors = table.apart_px
     return [int(place) for place in np.argsort(-np.nan_to_num(errors, nan=-1.0), kind="stable")]
 
 

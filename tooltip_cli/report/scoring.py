@@ -167,7 +167,7 @@ def score_detections(detections: Detections, table: FrameTable) -> DetectionScor
         flags=dict(sorted(flags.items())),
         error_px=summarize(errors),
         within_10_px=float((finite <= 10).mean()) if len(finite) else None,
-        consistency_px=summarize(pixel_errors(table.detection, table.prediction)),
+        consistency_px=summarize(table.apart_px),
     )
 
 

@@ -23,6 +23,7 @@ TOOL_COLUMNS = (
     *(f"detector_{name}" for name in ("status", *(f"px_{item}" for item in _STATISTICS))),
     *(f"baseline_{name}" for name in ("status", *(f"px_{item}" for item in _STATISTICS))),
     *(f"detection_px_{item}" for item in _STATISTICS),
+    "nearest_candidate_px",
     "tip_error_mm",
     "baseline_tip_error_mm",
     *(f"tip_{axis}_m" for axis in "xyz"),
@@ -78,6 +79,7 @@ def tool_rows(report: EvaluationReport) -> Iterator[list[str]]:
         "",
         *_statistics(overall.baseline_px),
         *filler,
+        "",
         number(mean_of(overall.tip_error_mm)),
         *[""] * 7,
     ]
@@ -99,6 +101,7 @@ def _tool_row(row: RecordingReport) -> list[str]:
         "" if baseline is None else baseline.status,
         *_statistics(row.baseline_px),
         *_statistics(row.detection_px),
+        number(None if detector is None else detector.nearest_px),
         number(row.tip_error_mm),
         number(row.baseline_tip_error_mm),
         *(number(value, 6) for value in position),

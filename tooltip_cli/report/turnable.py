@@ -90,6 +90,12 @@ def rays_figure(row: RecordingReport, scene: Scene) -> Drawing | None:
     for axes, panel in zip(grid, shown, strict=True):
         _draw(axes, panel, basis, center, radius, spheres, row)
     truth = "" if row.truth_m is None else "; diamond: the true tip"
+    method = "" if row.detector is None else row.detector.method
+    beyond = ""
+    if method not in ("", "kmeans"):
+        beyond = (
+            f" The method {method} does not cluster these intersections; they are for comparison."
+        )
     words = "; ".join(f"{panel.title}: {_panel_words(panel)}" for panel in shown)
     drawing = chart.drawing(
         f"{row.name}-rays",
@@ -98,7 +104,7 @@ def rays_figure(row: RecordingReport, scene: Scene) -> Drawing | None:
         f"{words[:1].upper()}{words[1:]}. Coloured points: hypothesised intersections of pairs of "
         "rays, by the nearest candidate (blue: the estimate's). Large circles: the hand and wrist, "
         "where no tip can be. Ring with cross: the estimate, with its 95 % region; small rings: "
-        f"other candidates{truth}. (Figure 4 of the paper.)",
+        f"other candidates{truth}.{beyond} (Figure 4 of the paper.)",
         ("panel", "kind", "cluster", "x1_m", "y1_m", "z1_m", "x2_m", "y2_m", "z2_m"),
         [line for panel in shown for line in _rows(panel)],
     )

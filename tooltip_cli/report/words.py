@@ -16,7 +16,7 @@ from tooltip_cli.report.model import (
     mean_of,
 )
 
-AMBIGUOUS = "ambiguous_end"  # the reason code of an estimate with a second right answer
+PERFECT_PX = 0.5  # nobody labels better than this
 AS_GOOD, CLOSE = 1.25, 2.0  # times the baseline's error
 
 
@@ -40,12 +40,17 @@ def verdict(row: RecordingReport) -> Verdict:
     if baseline is None:
         text = f"The projected tip lies {detector:.1f} px from the labels; there is no baseline."
         return Verdict("none", f"{detector:.1f} px", text)
-    times = detector / baseline
+    times = detector / baseline if baseline > 0 else float("inf")
     text = (
         f"The tip estimated from detections projects {detector:.1f} px from the labels on "
         f"average, {times:.1f} times the baseline's {baseline:.1f} px."
     )
-    if times <= AS_GOOD:
+    # an estimate with status ok may carry reservations
+    text = " ".join([text, *(sentence(reason.text) for reason in row.reasons)])
+    nearest = None if row.detector is None else row.detector.nearest_px
+    if nearest is not None and nearest < detector:
+        return Verdict("fair", "two ends", f"{text} The nearest candidate: {nearest:.1f} px.")
+    if detector <= max(AS_GOOD * baseline, PERFECT_PX):
         return Verdict("good", "as good as labels", text)
     if times <= CLOSE:
         return Verdict("fair", f"near: {times:.1f} × labels", text)
@@ -58,7 +63,8 @@ def sentence(text: str) -> str:
 
 
 def _without_labels(row: RecordingReport) -> str:
-    text = "Not measured: no label shows the tip."
+    why = "there are no labels" if row.labels is None else "no label shows the tip"
+    text = f"Not measured: {why}."
     apart = None if row.detection is None else row.detection.consistency_px
     if apart is not None:
         text += (
@@ -136,13 +142,15 @@ def region_words(score: EstimateScore) -> str:
         return text
     if score.inside_region:
         return f"{text}; it holds the true tip"
+    if score.ambiguous:
+        return f"{text}; the true tip lies outside, see the other candidates"
     return f"{text}; the true tip lies outside, so the stated uncertainty is too small"
 
 
 def candidate_words(score: EstimateScore) -> Iterator[str]:
     """Yield a sentence for every other candidate that is a second right answer, else one on all."""
     others = score.candidates[1:]
-    if any(reason.code == AMBIGUOUS for reason in score.reasons):
+    if score.ambiguous:
         for other in others:
             place = ", ".join(f"{1000 * value:.1f}" for value in other.position_m)
             text = f"({place}) mm, support {other.support:.0%}"
@@ -220,6 +228,8 @@ def headline(report: EvaluationReport) -> str:
             f"{interval(overall.detector_px)} px from the labels on average; estimated from the "
             f"labels themselves, {interval(overall.baseline_px)} px."
         )
+    if not any(row.labels for row in report.recordings):
+        text += " There are no labels, so no error in pixels is known."
     if overall.tip_error_mm is not None:
         text += f" It lies {overall.tip_error_mm.mean:.1f} mm from the true tip."
     if any(row.labels is not None and row.labels.simulated for row in report.recordings):

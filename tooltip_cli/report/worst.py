@@ -22,10 +22,10 @@ from tooltip_cli.report.model import FrameTable, RecordingReport
 from tooltip_cli.report.tables import number
 
 _FLOOR_PX = 0.1  # smaller errors are drawn here on the logarithmic axis
-_AXIS_WORDS = (
-    "about the camera's x axis (nodding)",
-    "about the camera's y axis (swinging sideways)",
-    "about the line of sight (rolling)",
+_AXES = (  # of the camera: x to the right, y down, z forward
+    "nod about the camera's x axis",
+    "swing about the camera's y axis",
+    "roll about the line of sight",
 )
 _LEAST_IN_SECTOR = 5
 
@@ -45,22 +45,20 @@ def _errors(table: FrameTable) -> tuple[Array, str]:
         return table.prediction_error_px, "prediction error"
     if np.isfinite(table.baseline_error_px).any():
         return table.baseline_error_px, "baseline error (there is no prediction)"
-    apart = np.asarray(np.linalg.norm(table.detection - table.prediction, axis=1))
-    return apart, "distance from detection to prediction (there are no labels)"
+    return table.apart_px, "distance from detection to prediction (there are no labels)"
 
 
 @styled
 def _over_time(row: RecordingReport, table: FrameTable) -> Drawing:
     seconds = (table.stamps_ns - table.stamps_ns[0]) * 1e-9
     labelled = np.isfinite(table.label).all(axis=1).any()
-    apart = np.asarray(np.linalg.norm(table.detection - table.prediction, axis=1))
     series = [
         ("detection", table.detection_error_px, DETECTION, "x", 3.0),
         ("prediction", table.prediction_error_px, DETECTOR, "o", 3.2),
         ("baseline", table.baseline_error_px, BASELINE, "o", 2.4),
     ]
     if not labelled:
-        series = [("detection to prediction", apart, DETECTION, "x", 3.0)]
+        series = [("detection to prediction", table.apart_px, DETECTION, "x", 3.0)]
     chart = Chart(2.6, top=0.3)
     axes = chart.axes()
     for name, errors, color, marker, size in series:
@@ -92,12 +90,13 @@ def _over_time(row: RecordingReport, table: FrameTable) -> Drawing:
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     bare(axes, "y")
     chart.legend_above(4)
+    subject = "Errors" if labelled else "Distances from detection to prediction"
     worst = _worst_stretch(seconds, _errors(table)[0])
     return chart.drawing(
         f"{row.name}-over-time",
         "Error over time",
-        f"Errors of {row.name} in each test frame over {seconds[-1]:.0f} seconds. {worst}",
-        f"Errors in each test frame. {worst}",
+        f"{subject} of {row.name} in each test frame over {seconds[-1]:.0f} seconds. {worst}",
+        f"{subject} in each test frame. {worst}",
         (
             "seconds",
             "detection_px",
@@ -115,7 +114,7 @@ def _over_time(row: RecordingReport, table: FrameTable) -> Drawing:
                         table.detection_error_px,
                         table.prediction_error_px,
                         table.baseline_error_px,
-                        apart,
+                        table.apart_px,
                     )
                 ),
                 str(int(hidden[index])),
@@ -160,10 +159,10 @@ def _over_turn(row: RecordingReport, table: FrameTable, errors: Array, kind: str
         edgecolors=MUTED,
     )
     bar = chart.canvas.colorbar(dots, ax=axes, shrink=0.9)
-    bar.set_label(f"{kind.split(' (')[0]} [px]")
+    bar.set_label("error [px]" if "error" in kind else "distance [px]")
     bar.outline.set_visible(False)
-    axes.set_xlabel(f"turn {_AXIS_WORDS[first]} [deg]")
-    axes.set_ylabel(f"turn {_AXIS_WORDS[second]}\n[deg]")
+    axes.set_xlabel(f"{_AXES[first]} [deg]")
+    axes.set_ylabel(f"{_AXES[second]} [deg]")
     bare(axes, "both")
     worst = _worst_sector(turns[known][:, [first, second]], errors[known], (first, second))
     return chart.drawing(
@@ -192,11 +191,10 @@ def _worst_sector(turns: Array, errors: Array, axes: tuple[int, int]) -> str:
             (f"less than {low:.0f} degrees", turns[:, column] < low),
         ):
             if inside.sum() >= _LEAST_IN_SECTOR:
-                found.append((float(errors[inside].mean()), f"{name} {_AXIS_WORDS[axis]}"))
+                found.append((float(errors[inside].mean()), f"{_AXES[axis]} is {name}"))
     if not found:
         return ""
     mean, where = max(found)
     return (
-        f"Worst where the hand is turned {where}: {mean:.1f} px, against "
-        f"{float(errors.mean()):.1f} px over all."
+        f"Worst where its {where}: {mean:.1f} px, against {float(errors.mean()):.1f} px over all."
     )

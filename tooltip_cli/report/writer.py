@@ -12,8 +12,9 @@ from tooltip_cli.log.recording import Recording
 from tooltip_cli.report.charts import Drawing
 from tooltip_cli.report.figures import detection_histogram, error_by_tool, error_by_training
 from tooltip_cli.report.model import EvaluationReport, FrameTable, RecordingReport
-from tooltip_cli.report.page import page, recording_section
+from tooltip_cli.report.page import page
 from tooltip_cli.report.scenes import Scene, by_severity, scene_figures, thumbnails
+from tooltip_cli.report.section import recording_section
 from tooltip_cli.report.tables import (
     FRAME_COLUMNS,
     TOOL_COLUMNS,
@@ -40,6 +41,7 @@ class ReportWriter:
         recordings: how many will come.
         save: writes a file, given its place relative to the directory, whole or not at all.
         plain: turns the report into what JSON has.
+        frame: image index that the figures show; default: a typical one.
     """
 
     def __init__(
@@ -48,18 +50,20 @@ class ReportWriter:
         recordings: int,
         save: Save,
         plain: Callable[[EvaluationReport], Any],
+        frame: int | None = None,
     ) -> None:
         self._directory, self._save, self._plain = directory, save, plain
+        self._frame = frame
         least, most = _A_RECORDING
         self._pictures = min(max(MOST_PICTURES // min(recordings, MOST_SECTIONS), least), most)
 
     def add(self, row: RecordingReport, table: FrameTable, scene: Scene) -> bool:
         """Write one recording's table, figures and section; return whether they were drawn anew."""
-        marker = f"<!-- {row.provenance['key']} {VERSION} {self._pictures} -->"
+        marker = f"<!-- {row.provenance['key']} {VERSION} {self._pictures} {self._frame} -->"
         section = self._part(row)
         if _first_line(section) == marker:
             return False
-        figures = list(_figures(row, table, scene))
+        figures = list(_figures(row, table, scene, self._frame))
         for figure in figures:
             self._figure(figure)
         places = by_severity(table)[: self._pictures]
@@ -118,8 +122,10 @@ class ReportWriter:
                 yield path.read_text(encoding="utf-8").split("\n", 1)[1]
 
 
-def _figures(row: RecordingReport, table: FrameTable, scene: Scene) -> Iterator[Drawing]:
-    yield from scene_figures(row, table, scene)
+def _figures(
+    row: RecordingReport, table: FrameTable, scene: Scene, frame: int | None
+) -> Iterator[Drawing]:
+    yield from scene_figures(row, table, scene, frame)
     rays = rays_figure(row, scene)
     if rays is not None:
         yield rays

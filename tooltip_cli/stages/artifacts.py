@@ -6,11 +6,11 @@ version, its parents' keys, its parameters, and what it depends on of the rig.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import numpy as np
 
 from tooltip_cli import __version__
 from tooltip_cli.errors import TooltipError
+from tooltip_cli.log.whole import write_file
 
 
 def stage_key(stage: str, version: int, parents: Mapping[str, str], parameters: Any) -> str:
@@ -90,6 +91,15 @@ def known_places(recording: Path, suffix: str, out: Path | None) -> list[Path]:
     return list(dict.fromkeys(places))
 
 
+def find_artifact(recording: Path, suffix: str, out: Path | None) -> Path | None:
+    """Return the first of the known places where a file is; None where there is none."""
+    for place in known_places(recording, suffix, out):
+        with contextlib.suppress(OSError):  # a name that no file can have
+            if place.exists():
+                return place
+    return None
+
+
 def ensure_directory(path: Path) -> None:
     """Create a directory for artifacts.
 
@@ -103,19 +113,13 @@ def ensure_directory(path: Path) -> None:
 
 
 def write_whole(path: Path, data: str | bytes) -> None:
-    """Write a file under a temporary name and rename it, so that it is whole or absent.
+    """Write an artifact whole or not at all, and its directory where that is missing.
 
     Raises:
         TooltipError: it cannot be written.
     """
     ensure_directory(path.parent)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise TooltipError(f"{path}: cannot be written ({error.strerror})") from error
+    write_file(path, data)
 
 
 def read_json(path: Path) -> Any | None:

@@ -156,11 +156,6 @@ def _detect_chunk(recording: Recording, params: DetectorParams, start: int) -> l
     first = next(images)
     rows = []
     for second in images:
-        if second.shape != first.shape:
-            raise TooltipError(
-                f"{recording.path}: the image size changes from {first.shape[1]}x{first.shape[0]} "
-                f"to {second.shape[1]}x{second.shape[0]} during the recording"
-            )
         rows.append(detect_tip(first, second, find_edges(first, params), params))
         first = second
     return rows

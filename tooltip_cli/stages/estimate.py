@@ -16,7 +16,7 @@ from tooltip_cli.errors import TooltipError
 from tooltip_cli.labels.files import MatchedLabels, match_labels, read_labels
 from tooltip_cli.log.recording import Recording, Topics, read_recording
 from tooltip_cli.log.views import Views, resolve_rig, resolve_views
-from tooltip_cli.method.detector import DetectorParams
+from tooltip_cli.method.detector import FEW_EDGES, NO_MOTION, Detections, DetectorParams
 from tooltip_cli.method.estimators import EstimationInput, EstimatorParams, estimate_tip
 from tooltip_cli.method.rays import rays_in_hand, sphere_array
 from tooltip_cli.method.types import (
@@ -38,9 +38,12 @@ from tooltip_cli.stages.artifacts import (
     write_whole,
 )
 from tooltip_cli.stages.detect import Detected, detect_in
+from tooltip_cli.stages.held_out import unlabelled
+from tooltip_cli.stages.moving import VERSION as EDGES_VERSION
+from tooltip_cli.stages.moving import DetectedEdges
+from tooltip_cli.stages.voting import vote
 
 SUFFIX = ".tip.json"
-LABELS_SUFFIX = ".labels.csv"
 VERSION = 1
 _LOGGER = logging.getLogger(__name__)
 
@@ -54,7 +57,7 @@ class Estimated:
     reused: bool
     estimate: TipEstimate
     document: dict[str, Any]  # what tip.json holds
-    detected: Detected | None  # None: from labels
+    detected: Detected | DetectedEdges | None  # None: from labels, or nothing was detected
     notes: tuple[str, ...] = ()  # what was odd about the recording
 
 
@@ -90,10 +93,17 @@ def estimate(
         labels = match_labels(read_labels(from_labels), recording.image_stamps_ns, views.camera)
         found = estimate_from_labels(recording, views, labels, params, out=out, force=force)
     else:
-        held_out = labelled_frames(recording, views, out)
-        detected = detect_in(recording, params=detector, out=out, jobs=jobs, on_pair=on_pair)
-        found = estimate_from_detections(
-            recording, views, detected, params, leave_out=held_out, out=out, force=force
+        allowed = unlabelled(recording, views.camera, out)
+        found = estimate_from_images(
+            recording,
+            views,
+            params,
+            allowed,
+            detector=detector,
+            out=out,
+            force=force,
+            jobs=jobs,
+            on_pair=on_pair,
         )
     return replace(found, notes=(*recording.notes, *_unknown_poses(views)))
 
@@ -108,13 +118,47 @@ def _unknown_poses(views: Views) -> list[str]:
     ]
 
 
-def labelled_frames(recording: Recording, views: Views, out: Path | None) -> npt.NDArray[np.intp]:
-    """Return the frames that ``STEM.labels.csv`` labels; empty where there is none."""
-    for place in known_places(recording.path, LABELS_SUFFIX, out):
-        if place.exists():
-            labels = match_labels(read_labels(place), recording.image_stamps_ns, views.camera)
-            return labels.frames
-    return np.zeros(0, dtype=np.intp)
+def estimate_from_images(
+    recording: Recording,
+    views: Views,
+    params: EstimatorParams,
+    allowed: npt.NDArray[np.bool_],
+    *,
+    detector: DetectorParams | None = None,
+    out: Path | None = None,
+    detected_out: Path | None = None,
+    force: bool = False,
+    jobs: int = 1,
+    on_pair: Callable[[], None] = lambda: None,
+) -> Estimated:
+    """Estimate from what moves in the allowed images, by the method that ``params`` names.
+
+    Args:
+        allowed: (N,) images that may be used; a detection belongs to its first image.
+        detector: of the paper's methods, ``kmeans`` and ``map``.
+        detected_out: directory for what is detected; default: ``out``.
+    """
+    detected_out = detected_out or out
+    if params.method != "voting":
+        detected = detect_in(
+            recording, params=detector, out=detected_out, jobs=jobs, on_pair=on_pair
+        )
+        return estimate_from_detections(
+            recording, views, detected, params, allowed, out=out, force=force
+        )
+    origin = {"recording": recording.sha256, "image_topic": recording.image_topic}
+    parents = {**origin, "allowed": digest(allowed), "edges_version": str(EDGES_VERSION)}
+    used: list[DetectedEdges] = []
+
+    def compute() -> TipEstimate:
+        result, edges = vote(
+            recording, views, params.voting, allowed, out=detected_out, jobs=jobs, on_frame=on_pair
+        )
+        used.extend([] if edges is None else [edges])
+        return result
+
+    found = _estimate(recording, views, compute, parents, params, out, force)
+    return Estimated(*found, used[0] if used else None)
 
 
 def estimate_from_detections(
@@ -122,21 +166,38 @@ def estimate_from_detections(
     views: Views,
     detected: Detected,
     params: EstimatorParams,
+    allowed: npt.NDArray[np.bool_],
     *,
-    leave_out: npt.NDArray[np.intp] | None = None,
-    only: npt.NDArray[np.intp] | None = None,
     out: Path | None = None,
     force: bool = False,
 ) -> Estimated:
-    """Estimate from detections in ``only`` these frames, or in all but ``leave_out``."""
+    """Estimate from the detections in the allowed images (N,)."""
     pixels = detected.detections.tip_pixels()
-    if only is not None:
-        pixels = pixels.select(np.isin(pixels.frames, only))
-    elif leave_out is not None:
-        pixels = pixels.select(~np.isin(pixels.frames, leave_out))
+    pixels = pixels.select(allowed[pixels.frames])
     parents = {"detections": detected.key, "frames": digest(pixels.frames)}
-    found = _estimate(recording, views, pixels, parents, params, out, force)
-    return Estimated(*found, detected)
+
+    def compute() -> TipEstimate:
+        if not len(pixels.frames):
+            return refused(params.method, 0, _nothing_detected(detected.detections))
+        return estimate_tip(estimation_input(views, pixels), params)
+
+    return Estimated(*_estimate(recording, views, compute, parents, params, out, force), detected)
+
+
+def _nothing_detected(detections: Detections) -> Reason:
+    """Return why no frame has a detection: darkness, or nothing that moves."""
+    dark = sum(FEW_EDGES in flags for flags in detections.flags)
+    if dark > len(detections.flags) / 2:
+        return Reason(
+            "few_edges",
+            f"{dark} of {len(detections.flags)} pairs of images have too few edges to match; light "
+            "the scene, and check that the camera sees it",
+        )
+    return Reason(
+        NO_MOTION,
+        "no frame shows anything that moves against the background; turn the wrist while "
+        "recording, slowly enough for the camera",
+    )
 
 
 def estimate_from_labels(
@@ -151,13 +212,20 @@ def estimate_from_labels(
     """Estimate from hand labels: the paper's baseline (4.3)."""
     pixels = labels.visible
     parents = {"labels": digest(pixels), "image_stamps": digest(recording.image_stamps_ns)}
-    return Estimated(*_estimate(recording, views, pixels, parents, params, out, force), None)
+
+    def compute() -> TipEstimate:
+        if not len(pixels.frames):
+            reason = Reason("no_labels", "no label shows the tip; label frames in which it is seen")
+            return refused(params.method, 0, reason)
+        return estimate_tip(estimation_input(views, pixels), params)
+
+    return Estimated(*_estimate(recording, views, compute, parents, params, out, force), None)
 
 
 def _estimate(
     recording: Recording,
     views: Views,
-    pixels: TipPixels,
+    compute: Callable[[], TipEstimate],
     parents: dict[str, str],
     params: EstimatorParams,
     out: Path | None,
@@ -165,14 +233,15 @@ def _estimate(
 ) -> tuple[Path, str, bool, TipEstimate, dict[str, Any]]:
     parents = {**parents, "camera": digest(views.camera), "spheres": digest(views.spheres)}
     parents["poses"] = digest(views.hand_from_camera)
-    key = stage_key("estimate", VERSION, parents, params)
+    settings = {"method": params.method, "settings": params.relevant}
+    key = stage_key("estimate", VERSION, parents, settings)
     if not force:
         for place in known_places(recording.path, SUFFIX, out):
             stored = _stored(place, key)
             if stored is not None:
                 return place, key, True, *stored
-    result = _compute(views, pixels, params)
-    document = tip_document(result, provenance(recording.path, recording.sha256, key, params))
+    result = compute()
+    document = tip_document(result, provenance(recording.path, recording.sha256, key, settings))
     path = artifact_path(recording.path, SUFFIX, out)
     write_whole(path, json.dumps(document, indent=1) + "\n")
     return path, key, False, result, document
@@ -188,17 +257,6 @@ def _stored(place: Path, key: str) -> tuple[TipEstimate, dict[str, Any]] | None:
     except (KeyError, TypeError, TooltipError):
         _LOGGER.info("%s cannot be read and is made anew", place)
         return None
-
-
-def _compute(views: Views, pixels: TipPixels, params: EstimatorParams) -> TipEstimate:
-    if not len(pixels.frames):
-        reason = Reason(
-            "no_motion",
-            "no frame shows anything that moves against the background; turn the wrist while "
-            "recording, slowly enough for the camera",
-        )
-        return refused(params.method, 0, reason)
-    return estimate_tip(estimation_input(views, pixels), params)
 
 
 def estimation_input(views: Views, pixels: TipPixels) -> EstimationInput:
@@ -225,9 +283,14 @@ def tip_document(result: TipEstimate, origin: dict[str, Any]) -> dict[str, Any]:
         "position_m": plain(result.position),
         "covariance_m2": plain(result.covariance),
     }
-    candidates = [
-        {"position_m": plain(item.position), "support": item.support} for item in result.candidates
-    ]
+    candidates = []
+    for item in result.candidates:
+        candidate = {"position_m": plain(item.position), "support": item.support}
+        if item.covariance is not None:
+            candidate["covariance_m2"] = plain(item.covariance)
+        if item.axis is not None:
+            candidate["axis"] = plain(item.axis)
+        candidates.append(candidate)
     return {
         "status": result.status,
         "tip": None if result.position is None else tip,
@@ -252,7 +315,12 @@ def estimate_from_document(document: dict[str, Any], path: Path) -> TipEstimate:
             position=None if tip is None else np.array(tip["position_m"], dtype=float),
             covariance=None if tip is None else np.array(tip["covariance_m2"], dtype=float),
             candidates=tuple(
-                Candidate(np.array(item["position_m"], dtype=float), float(item["support"]))
+                Candidate(
+                    np.array(item["position_m"], dtype=float),
+                    float(item["support"]),
+                    _array(item.get("covariance_m2")),
+                    _array(item.get("axis")),
+                )
                 for item in document["candidates"]
             ),
             reasons=tuple(Reason(item["code"], item["text"]) for item in document["reasons"]),
@@ -262,3 +330,7 @@ def estimate_from_document(document: dict[str, Any], path: Path) -> TipEstimate:
         raise TooltipError(
             f"{path} is not a tip file ({error!r}); --force makes it anew"
         ) from error
+
+
+def _array(value: Any) -> npt.NDArray[np.float64] | None:
+    return None if value is None else np.array(value, dtype=float)

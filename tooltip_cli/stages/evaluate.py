@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from tooltip_cli import __version__
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.labels.files import MatchedLabels, match_labels, read_labels
@@ -41,11 +43,11 @@ from tooltip_cli.stages.artifacts import (
 )
 from tooltip_cli.stages.detect import Detected, detect_in
 from tooltip_cli.stages.estimate import (
-    LABELS_SUFFIX,
     Estimated,
-    estimate_from_detections,
+    estimate_from_images,
     estimate_from_labels,
 )
+from tooltip_cli.stages.held_out import LABELS_SUFFIX
 from tooltip_cli.stages.measure import Case, Labelled, Protocol, measure
 
 VERSION = 1
@@ -87,7 +89,8 @@ def evaluate(
     split: str = "random",
     params: EstimatorParams | None = None,
     detector: DetectorParams | None = None,
-    curve: bool = True,
+    curve: bool | None = None,
+    frame: int | None = None,
     out: Path | None = None,
     force: bool = False,
     jobs: int = 1,
@@ -107,7 +110,10 @@ def evaluate(
         second_labels: likewise, of a second annotator; default: ``STEM.labels.*.csv``.
         rig: rig file, or a folder with ``STEM.rig.yaml``; default: the one in the recording.
         split: ``random`` or ``blocks``; where labels exist they decide.
-        curve: estimate from ever fewer training frames too, which takes a dozen estimates.
+        curve: estimate from ever fewer training frames too, which takes several estimates;
+            default: where that is quick.
+        frame: image index that the figures of each recording show, or the test frame nearest to
+            it; default: one whose error is typical.
         out: directory of the report; default: ``report`` beside the first recording. Stages that
             have to run write there, and without ``out`` beside each recording.
         on_pair: called after every pair of images that the detector works on.
@@ -129,7 +135,11 @@ def evaluate(
     places = Places(report_dir, out, labels, second_labels, rig)
     totals, rows = Totals(), []
     writer = ReportWriter(
-        report_dir, len(recordings), lambda name, data: write_whole(report_dir / name, data), plain
+        report_dir,
+        len(recordings),
+        lambda name, data: write_whole(report_dir / name, data),
+        plain,
+        frame,
     )
     for path in recordings:
         try:
@@ -198,14 +208,16 @@ def evaluate_recording(
     on_step(path, f"{_how(detected.reused)} {detected.path}")
     tips = places.report / "tips"
     found = {
-        "detections": estimate_from_detections(
+        "detections": estimate_from_images(
             recording,
             views,
-            detected,
             protocol.params,
-            only=split.train,
+            np.isin(np.arange(len(recording.image_stamps_ns)), split.train),
+            detector=protocol.detector,
             out=tips / "detections",
+            detected_out=places.out,
             force=force,
+            jobs=jobs,
         )
     }
     if labelled is not None and len(labelled.labels.visible.frames):
@@ -230,7 +242,20 @@ def evaluate_recording(
     if stored is not None:
         on_step(path, f"reused {place}")
         return Evaluated(*stored, True, scene)
-    case = Case(recording, rig, views, labelled, split, detected, found, truth, protocol, key)
+    detected_out = places.out or tips / "detections"
+    case = Case(
+        recording,
+        rig,
+        views,
+        labelled,
+        split,
+        detected,
+        found,
+        truth,
+        protocol,
+        key,
+        detected_out,
+    )
     row, table = measure(case, places.report)
     document = {"key": key, "row": plain(row), "frames": plain(table)}
     write_whole(place, json.dumps(document) + "\n")

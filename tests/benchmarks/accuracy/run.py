@@ -1,0 +1,172 @@
+"""Accuracy of the estimators on simulated tools and on given recordings, in one table.
+
+Example:
+    python tests/benchmarks/accuracy/run.py --work /tmp/accuracy --seeds 0 1 2 3 4
+    python tests/benchmarks/accuracy/run.py --work /tmp/accuracy --perturb noise half 15hz
+    python tests/benchmarks/accuracy/run.py --work /tmp/accuracy --recordings DIR/*.mcap
+
+Simulated recordings are made once under ``--work`` and reused. A given recording needs
+STEM.rig.yaml, STEM.labels.csv and, for millimetres, STEM.truth.json beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tooltip_cli.labels.files import match_labels, read_labels
+from tooltip_cli.log.recording import read_recording
+from tooltip_cli.log.views import Views, resolve_rig, resolve_views
+from tooltip_cli.method.estimators import EstimatorParams
+from tooltip_cli.method.evaluation import pixel_errors
+from tooltip_cli.method.types import Array, TipEstimate, TipPixels
+from tooltip_cli.rig.kinematics import inverse_transform
+from tooltip_cli.sources.sim import TOOLS, SimParams
+from tooltip_cli.stages.estimate import estimate_from_images, estimate_from_labels
+from tooltip_cli.stages.held_out import unlabelled
+from tooltip_cli.stages.simulate import reuse_simulation
+
+PERTURBATIONS: dict[str, dict[str, Any]] = {
+    "none": {},
+    "noise": {"noise_sigma": 4.0},
+    "half": {"size": (320, 240)},
+    "15hz": {"fps": 15.0, "frames": 250},
+    "q50": {"jpeg_quality": 50},
+    "head": {"head_motion_deg": 2.0},
+    "grip+": {"grip_offset_m": 0.02},
+    "grip-": {"grip_offset_m": -0.02},
+    "tilt+": {"tilt_deg": 40.0},
+    "tilt-": {"tilt_deg": -40.0},
+    "fast": {"motion": "fast"},
+    "late": {"time_offset_s": 0.03},
+    "in_plane": {"motion": "in_plane"},
+    "still": {"motion": "still"},
+}
+CHI2_95 = 7.815  # three degrees of freedom
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--work", type=Path, required=True, help="directory for what is made")
+    parser.add_argument("--tools", nargs="+", default=list(TOOLS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--perturb", nargs="+", default=["none"], choices=list(PERTURBATIONS))
+    parser.add_argument("--methods", nargs="+", default=["voting", "kmeans"])
+    parser.add_argument("--recordings", nargs="*", type=Path, default=[])
+    arguments = parser.parse_args()
+    rows = []
+    cases = [(path, path.with_suffix(".rig.yaml"), "given") for path in arguments.recordings]
+    if not arguments.recordings:
+        cases = list(_simulated(arguments))
+    for path, rig, group in cases:
+        for row in _score(path, rig, arguments.methods, arguments.work / "results"):
+            rows.append({"group": group, **row})
+            print(_line(rows[-1]), flush=True)
+    (arguments.work / "accuracy.json").write_text(json.dumps(rows, indent=1))
+    for group in dict.fromkeys(row["group"] for row in rows):
+        for method in dict.fromkeys(row["method"] for row in rows):
+            _summary(
+                group, method, [r for r in rows if (r["group"], r["method"]) == (group, method)]
+            )
+
+
+def _simulated(arguments: argparse.Namespace) -> Any:
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    for perturbation in arguments.perturb:
+        for seed in arguments.seeds:
+            for tool in arguments.tools:
+                params = SimParams(tool=tool, seed=seed)
+                params = dataclasses.replace(params, **PERTURBATIONS[perturbation])
+                path = arguments.work / f"{tool}-{seed}-{perturbation}.mcap"
+                yield reuse_simulation(params, path, jobs=2).recording, None, perturbation
+
+
+def _score(path: Path, rig: Path | None, methods: list[str], out: Path) -> list[dict[str, Any]]:
+    recording = read_recording(path)
+    views = resolve_views(recording, resolve_rig(recording, rig))
+    labels = match_labels(
+        read_labels(path.with_suffix(".labels.csv")), recording.image_stamps_ns, views.camera
+    )
+    truth = _truth(path, recording.attachments)
+    baseline = estimate_from_labels(
+        recording, views, labels, EstimatorParams(method="map"), out=out / "labels"
+    ).estimate
+    rows = [
+        {"name": path.stem, "method": "labels", **_errors(baseline, views, labels.visible, truth)}
+    ]
+    for method in methods:
+        start = time.perf_counter()
+        found = estimate_from_images(
+            recording,
+            views,
+            EstimatorParams(method=method),
+            unlabelled(recording, views.camera, None),
+            out=out / method,
+            force=True,
+        ).estimate
+        row = {"name": path.stem, "method": method, "seconds": time.perf_counter() - start}
+        rows.append({**row, **_errors(found, views, labels.visible, truth)})
+    return rows
+
+
+def _truth(path: Path, attachments: Any) -> Array | None:
+    beside = path.with_suffix(".truth.json")
+    text = beside.read_text() if beside.exists() else attachments.get("truth.json")
+    return None if text is None else np.array(json.loads(text)["tip_in_hand_m"])
+
+
+def _errors(
+    found: TipEstimate, views: Views, labels: TipPixels, truth: Array | None
+) -> dict[str, Any]:
+    codes = [reason.code for reason in found.reasons]
+    row: dict[str, Any] = {"status": found.status, "codes": codes}
+    if found.position is None or found.covariance is None:
+        return row
+    places = [found.position, *(item.position for item in found.candidates[1:])]
+    if "ambiguous_end" not in codes:
+        places = places[:1]
+    pixels = [_mean_px(place, views, labels) for place in places]
+    row |= {"px": pixels[0], "nearest_px": min(pixels)}
+    if truth is not None:
+        error = found.position - truth
+        millimetres = [float(1000 * np.linalg.norm(place - truth)) for place in places]
+        inside = float(error @ np.linalg.solve(found.covariance, error)) <= CHI2_95
+        row |= {"mm": millimetres[0], "nearest_mm": min(millimetres), "covered": inside}
+    return row
+
+
+def _mean_px(place: Array, views: Views, labels: TipPixels) -> float:
+    camera = inverse_transform(views.hand_from_camera[labels.frames])
+    projected = views.camera.project(camera[:, :3, :3] @ place + camera[:, :3, 3])
+    return float(np.nanmean(pixel_errors(projected, labels.pixels)))
+
+
+def _line(row: dict[str, Any]) -> str:
+    numbers = "".join(
+        f" {name} {row[name]:6.2f}" for name in ("px", "mm", "nearest_px", "seconds") if name in row
+    )
+    return f"{row['name']:32} {row['method']:8}{numbers} {row['status']} {' '.join(row['codes'])}"
+
+
+def _summary(group: str, method: str, rows: list[dict[str, Any]]) -> None:
+    answered = [row for row in rows if "px" in row]
+    text = f"{group:10} {method:8} {len(answered)} of {len(rows)} answered"
+    for name in ("px", "nearest_px", "mm", "nearest_mm"):
+        values = [row[name] for row in answered if name in row]
+        if values:
+            text += f"; {name} mean {np.mean(values):.2f} worst {np.max(values):.2f}"
+    covered = [row["covered"] for row in answered if "covered" in row]
+    if covered:
+        text += f"; 95 % region holds the truth in {np.mean(covered):.0%}"
+    flagged = sum("ambiguous_end" in row["codes"] for row in rows)
+    print(text + f"; ambiguous_end {flagged}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,192 @@
+"""Estimates by voting through the real commands, on small simulated recordings."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.helpers.cli import Outcome, tooltip
+from tooltip_cli.labels.files import read_labels
+from tooltip_cli.log.container import LoggedAttachment, iterate
+from tooltip_cli.log.edges import read_edges
+from tooltip_cli.log.recording import Topics, read_recording
+from tooltip_cli.log.views import resolve_rig, resolve_views
+from tooltip_cli.method.voting.moving import MovingEdges
+from tooltip_cli.method.voting.params import VotingSettings
+from tooltip_cli.stages.voting import pair_views
+
+
+def simulate(path: Path, frames: int, size: str, motion: str = "sweep") -> Path:
+    options = ("--tool", "screwdriver", "--background", "clutter", "--motion", motion)
+    done = tooltip("record", "sim", path, "--frames", frames, "--size", size, *options)
+    assert done.code == 0, done.err
+    return path
+
+
+@dataclass(frozen=True)
+class Run:
+    """An estimate: the recording, and what was printed."""
+
+    recording: Path
+    outcome: Outcome
+
+    @property
+    def edges_path(self) -> Path:
+        return self.recording.with_name("small.edges.mcap")
+
+    @property
+    def tip_path(self) -> Path:
+        return self.recording.with_name("small.tip.json")
+
+    @property
+    def document(self) -> dict[str, Any]:
+        document: dict[str, Any] = json.loads(self.tip_path.read_text())
+        return document
+
+
+@pytest.fixture(scope="session")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Return a small recording with its estimate, which nobody may change."""
+    path = simulate(tmp_path_factory.mktemp("voting") / "small.mcap", 100, "240x180")
+    return Run(path, tooltip("estimate", path, "--jobs", 2))
+
+
+@pytest.fixture
+def run(first: Run, tmp_path: Path) -> Run:
+    """Return a copy of it that may be changed."""
+    folder = Path(shutil.copytree(first.recording.parent, tmp_path / "copy"))
+    return Run(folder / first.recording.name, first.outcome)
+
+
+def stored_edges(run: Run, path: Path | None = None) -> MovingEdges:
+    recording = read_recording(run.recording, Topics())
+    return read_edges(path or run.edges_path, recording.image_stamps_ns)
+
+
+def truth(path: Path) -> dict[str, Any]:
+    (text,) = (
+        item.data
+        for item in iterate(path)
+        if isinstance(item, LoggedAttachment) and item.name == "truth.json"
+    )
+    document: dict[str, Any] = json.loads(text)
+    return document
+
+
+def test_the_tip_is_found(first: Run) -> None:
+    assert first.outcome.code == 0, first.outcome.err
+    assert f"computed {first.edges_path}" in first.outcome.err
+    assert f"computed {first.tip_path}" in first.outcome.err
+    document = first.document
+    assert document["status"] == "ok"
+    assert document["method"] == "voting"
+    assert document["frames_used"] == len(stored_edges(first).frames)
+    error = np.subtract(document["tip"]["position_m"], truth(first.recording)["tip_in_hand_m"])
+    assert np.linalg.norm(error) < 0.015
+    candidate = document["candidates"][0]
+    assert candidate["position_m"] == document["tip"]["position_m"]
+    axis = truth(first.recording)["axis"]
+    assert np.dot(candidate["axis"], axis) / np.linalg.norm(axis) > np.cos(np.radians(30))
+
+
+def test_labelled_frames_are_never_used(first: Run) -> None:
+    recording = read_recording(first.recording, Topics())
+    labels = read_labels(first.recording.with_name("small.labels.csv"))
+    labelled = set(np.searchsorted(recording.image_stamps_ns, labels.stamps_ns).tolist())
+    assert len(labelled) >= 5
+    edges = stored_edges(first)
+    used = {*edges.frames.tolist(), *edges.partners.ravel().tolist()}
+    assert not used & labelled
+    # they would be, had they no labels
+    views = resolve_views(recording, resolve_rig(recording, None))
+    everything = np.ones(len(views.stamps_ns), dtype=bool)
+    free, _ = pair_views(views, VotingSettings(), everything)
+    assert {*free.frames.tolist(), *free.partners.ravel().tolist()} & labelled
+
+
+def test_edges_lie_in_the_image_and_within_the_search_window(first: Run) -> None:
+    edges = stored_edges(first)
+    assert (edges.counts > 0).mean() > 0.9
+    assert edges.pixels.max(axis=0).tolist() < [240, 180]
+    assert np.abs(edges.translations).max() <= VotingSettings().moving.search // 2
+    assert (edges.partners[:, 0] < edges.frames).all()
+    assert (edges.partners[:, 1] > edges.frames).all()
+
+
+def test_a_second_run_reuses_everything(run: Run) -> None:
+    before = {path: path.stat().st_mtime_ns for path in run.recording.parent.iterdir()}
+    again = tooltip("estimate", run.recording)
+    assert again.code == 0
+    assert again.out == run.outcome.out
+    assert f"reused {run.tip_path}" in again.err
+    assert "computed" not in again.err
+    assert {path: path.stat().st_mtime_ns for path in run.recording.parent.iterdir()} == before
+
+
+def test_an_estimate_that_is_gone_is_made_from_the_same_edges(run: Run) -> None:
+    before = run.document
+    run.tip_path.unlink()
+    again = tooltip("estimate", run.recording)
+    assert f"reused {run.edges_path}" in again.err
+    assert f"computed {run.tip_path}" in again.err
+    for name in ("status", "tip", "candidates", "reasons", "frames_used"):
+        assert run.document[name] == before[name]
+
+
+def test_damaged_edges_are_made_anew_by_one_thread_and_are_the_same(run: Run) -> None:
+    before = stored_edges(run)
+    whole = run.edges_path.read_bytes()
+    run.edges_path.write_bytes(whole[: len(whole) // 2])
+    run.tip_path.unlink()
+    again = tooltip("estimate", run.recording, "--jobs", 1)
+    assert again.code == 0
+    assert f"computed {run.edges_path}" in again.err
+    assert again.out == run.outcome.out
+    after = stored_edges(run)
+    names = ("frames", "partners", "affines", "counts", "pixels", "translations", "covariances")
+    for name in names:
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name), name)
+
+
+def test_other_labels_are_other_edges(run: Run) -> None:
+    """Labels of other images: neither the edges nor the estimate of before is reused."""
+    path = run.recording.with_name("small.labels.csv")
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[:-2]))
+    again = tooltip("estimate", run.recording, "--jobs", 2)
+    assert again.code == 0
+    assert f"computed {run.edges_path}" in again.err
+    assert f"computed {run.tip_path}" in again.err
+
+
+@pytest.mark.parametrize(
+    ("motion", "frames", "size", "code"),
+    [
+        ("in_plane", 60, "160x120", "depth_unobservable"),
+        ("still", 12, "160x120", "no_motion"),
+        ("fast", 8, "640x480", "too_fast"),
+    ],
+)
+def test_motion_that_cannot_show_the_tip_is_refused(
+    tmp_path: Path, motion: str, frames: int, size: str, code: str
+) -> None:
+    run = Run(simulate(tmp_path / "small.mcap", frames, size, motion), Outcome(0, "", ""))
+    done = tooltip("estimate", run.recording)
+    assert done.code == 3
+    assert done.out == f"small: refused ({code})\n"
+    assert f"refused: {code}: " in done.err
+    document = run.document
+    assert document["status"] == "refused"
+    assert document["tip"] is None
+    assert document["candidates"] == []
+    assert [reason["code"] for reason in document["reasons"]] == [code]
+    assert not run.edges_path.exists()  # the motion alone told
+    again = tooltip("estimate", run.recording)
+    assert again.code == 3
+    assert f"reused {run.tip_path}" in again.err

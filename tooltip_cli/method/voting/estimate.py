@@ -1,0 +1,190 @@
+"""The tip from all moving edges: reconstruct, find the end, say how good it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tooltip_cli.method.rays import angular_spread
+from tooltip_cli.method.types import Array, Candidate, Reason, TipEstimate, refused
+from tooltip_cli.method.voting.end import Shape, ToolEnd, far_voxels, locate_end, tool_shape
+from tooltip_cli.method.voting.pairing import Pairing
+from tooltip_cli.method.voting.params import EndParams, TrustParams, VotingSettings
+from tooltip_cli.method.voting.volume import Cloud, HandEdges, reconstruct
+
+METHOD = "voting"
+_FRAMES_FOR_SPREAD = 10  # fewer cannot show that the camera keeps to one side of the hand
+
+
+def check_motion(
+    pairing: Pairing, camera_from_hand: Array, settings: VotingSettings
+) -> Reason | None:
+    """Return why the hand's motion cannot show the tip, or None where it can."""
+    trust, count = settings.trust, len(pairing.frames)
+    spread = _view_spread_deg(camera_from_hand[pairing.frames])
+    if count >= _FRAMES_FOR_SPREAD and spread < trust.min_view_angle_deg:
+        return Reason(
+            "depth_unobservable",
+            f"seen from the hand, the camera moves by only {spread:.0f} degrees, so the tip's "
+            "depth cannot be told; tilt the wrist out of the image plane",
+        )
+    if count >= trust.min_frames:
+        return None
+    if pairing.fastest_px > settings.pairing.displacement_px:
+        return Reason(
+            "too_fast",
+            f"a tool's end moves by about {pairing.fastest_px:.0f} pixels between images, and at "
+            f"most {settings.pairing.max_displacement_px:.0f} can be followed, which only "
+            f"{count} frames keep to; turn the wrist more slowly, or record at a higher rate",
+        )
+    return Reason(
+        "no_motion",
+        f"the hand turns enough in only {count} frames, at least {trust.min_frames} are needed; "
+        "turn the wrist further while recording",
+    )
+
+
+def _view_spread_deg(camera_from_hand: Array) -> float:
+    """Return the largest angle between the camera's directions seen from the hand, degrees."""
+    seen_from = np.linalg.inv(camera_from_hand)[:, :3, 3]
+    lengths = np.linalg.norm(seen_from, axis=1, keepdims=True)
+    return float(np.degrees(angular_spread(seen_from / lengths)))
+
+
+def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSettings) -> TipEstimate:
+    """Find the tool's far end among all edges that move with the hand.
+
+    Args:
+        spheres: (S, 4) centre and radius of hand and wrist, metres.
+    """
+    used = len(edges.moving.frames)
+    cloud = reconstruct(edges, settings.voting)
+    shape = tool_shape(cloud, spheres, edges.reach, settings.end)
+    trust = settings.trust
+    if cloud.score < trust.min_score or cloud.consistent < trust.min_consistent:
+        return refused(METHOD, used, _nothing_consistent(cloud))
+    if not len(shape.voxels):
+        return refused(METHOD, used, _only_the_hand())
+    candidates = [
+        _candidate(cloud, shape, shape.voxels[far], spheres, edges.reach, settings)
+        for far in far_voxels(shape, settings.end)
+    ]
+    first = candidates[0]
+    least = settings.end.other_end_support * first.support
+    candidates = [first, *(item for item in candidates[1:] if item.support >= least)]
+    reason = _hidden(first.position, edges, trust)
+    if reason is not None:
+        return refused(METHOD, used, reason)
+    reasons = () if len(candidates) == 1 else (_ambiguous(candidates),)
+    return TipEstimate(METHOD, first.position, first.covariance, tuple(candidates), reasons, used)
+
+
+def _candidate(
+    cloud: Cloud,
+    shape: Shape,
+    far: Array,
+    spheres: Array,
+    reach: float,
+    settings: VotingSettings,
+) -> Candidate:
+    end = locate_end(cloud, shape, far, spheres, settings.end)
+    covariance = _covariance(cloud, end, far, spheres, reach, settings)
+    return Candidate(end.position, end.support, covariance, end.axis)
+
+
+def _covariance(
+    cloud: Cloud,
+    end: ToolEnd,
+    far: Array,
+    spheres: Array,
+    reach: float,
+    settings: VotingSettings,
+) -> Array:
+    """Return (3, 3) m^2: the scatter over random halves of the frames, and a floor.
+
+    The end found from half the frames differs from that of all by as much as that of all differs
+    from the truth, as far as chance goes. What frames have in common (calibration, the shape of
+    the end, the voxels) is the floor.
+    """
+    trust = settings.trust
+    rng = np.random.default_rng(trust.seed)
+    deviations = []
+    for _ in range(trust.halves):
+        half = rng.permutation(cloud.frame_count)[: cloud.frame_count // 2]
+        kept = np.isin(cloud.frames, half)
+        part = replace(cloud, points=cloud.points[kept], frames=cloud.frames[kept])
+        found = _end_near(part, far, spheres, reach, settings.end)
+        if found is not None:
+            deviations.append(found - end.position)
+    floor = (trust.floor + trust.floor_per_radius * end.radius) ** 2 * np.eye(3)
+    if not deviations:
+        return floor
+    scatter = np.array(deviations)
+    covariance: Array = scatter.T @ scatter / len(scatter) + floor
+    return covariance
+
+
+def _end_near(
+    cloud: Cloud, far: Array, spheres: Array, reach: float, params: EndParams
+) -> Array | None:
+    """Return the (3,) end of a thinner cloud on the same side of the tool; None: not there."""
+    shape = tool_shape(cloud, spheres, reach, params)
+    near = np.linalg.norm(shape.voxels - far, axis=1) < params.end_separation
+    if not near.any():
+        return None
+    voxels = shape.voxels[near]
+    start = voxels[int(np.argmax(np.linalg.norm(voxels, axis=1)))]
+    return locate_end(cloud, shape, start, spheres, params).position
+
+
+def _hidden(position: Array, edges: HandEdges, trust: TrustParams) -> Reason | None:
+    """Return why the end that was found may not be the tool's end, or None."""
+    if np.linalg.norm(position) > 0.95 * edges.reach:
+        return Reason(
+            "beyond_reach",
+            f"the tool reaches to where the search ends, {edges.reach:.2f} m from the hand; "
+            "its end may lie farther out",
+        )
+    camera = edges.camera_from_hand[edges.moving.frames]
+    points = camera[:, :3, :3] @ position + camera[:, :3, 3]
+    normalized = points[:, :2] / np.maximum(points[:, 2:], 1e-6)
+    low, high = edges.extent
+    inside = ((normalized > low) & (normalized < high)).all(axis=1) & (points[:, 2] > 0)
+    share = float(inside.mean())
+    if share < trust.min_in_view:
+        return Reason(
+            "out_of_view",
+            f"the tool's end lies inside the image in only {share:.0%} of the frames; hold the "
+            "tool nearer to the middle of the image",
+        )
+    return None
+
+
+def _nothing_consistent(cloud: Cloud) -> Reason:
+    return Reason(
+        "inconsistent_views",
+        f"only {cloud.consistent:.0%} of what moves is fixed to the hand, and no place on the hand "
+        f"shows in more than {cloud.score:.0%} of the frames; check the calibration and the "
+        "clocks, keep the fingers still, and let nothing else move near the hand",
+    )
+
+
+def _only_the_hand() -> Reason:
+    return Reason(
+        "nothing_beyond_the_hand",
+        "nothing fixed to the hand shows outside the spheres that stand for hand and wrist; check "
+        "hand.spheres in the rig file, and that the hand holds a tool",
+    )
+
+
+def _ambiguous(candidates: list[Candidate]) -> Reason:
+    others = ", ".join(
+        "(" + ", ".join(f"{1000 * value:.0f}" for value in item.position) + ")"
+        for item in candidates[1:]
+    )
+    return Reason(
+        "ambiguous_end",
+        f"the tool has {len(candidates)} ends at nearly the same distance from the wrist; the "
+        f"farthest is given, the others are at {others} mm",
+    )

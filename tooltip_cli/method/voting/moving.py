@@ -1,0 +1,201 @@
+"""Edges that move against the background, near the hand (3.1, applied to every edge)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tooltip_cli.method.affine import fit_background, mahalanobis
+from tooltip_cli.method.blocks import match_blocks, matchable
+from tooltip_cli.method.types import Array, Indices
+from tooltip_cli.method.voting.params import MovingParams
+
+Image = npt.NDArray[np.uint8]
+
+_FLAT = 20  # fewer edges than this cannot tell the background's motion
+_CHANGE_REACH = 5  # pixels around a change within which its edge lies
+
+
+@dataclass(frozen=True)
+class MovingEdges:
+    """Moving edges of many frames, frame by frame, with their motion to two partners."""
+
+    frames: Indices  # (F,) image indices
+    partners: Indices  # (F, 2) image indices
+    affines: Array  # (F, 2, 2, 3) background motion to each partner; NaN: no model
+    counts: npt.NDArray[np.int64]  # (F,) edges of each frame
+    pixels: npt.NDArray[np.uint16]  # (E, 2) u, v
+    translations: npt.NDArray[np.int8]  # (E, 2, 2) du, dv to each partner, pixels
+    covariances: npt.NDArray[np.float32]  # (E, 2, 3) C_uu, C_uv, C_vv to each partner, px^2
+
+    @property
+    def frame_of_edge(self) -> Indices:
+        """(E,) row of ``frames`` that each edge belongs to."""
+        return np.repeat(np.arange(len(self.frames)), self.counts)
+
+
+@dataclass(frozen=True)
+class FrameEdges:
+    """The same for one frame."""
+
+    affines: Array  # (2, 2, 3)
+    pixels: npt.NDArray[np.uint16]
+    translations: npt.NDArray[np.int8]
+    covariances: npt.NDArray[np.float32]
+
+
+def join(frames: Indices, partners: Indices, parts: list[FrameEdges]) -> MovingEdges:
+    """Put the frames' edges together."""
+    return MovingEdges(
+        frames,
+        partners.reshape(-1, 2),
+        np.array([part.affines for part in parts], dtype=float).reshape(-1, 2, 2, 3),
+        np.array([len(part.pixels) for part in parts], dtype=np.int64),
+        np.concatenate([np.zeros((0, 2), np.uint16), *(part.pixels for part in parts)]),
+        np.concatenate([np.zeros((0, 2, 2), np.int8), *(part.translations for part in parts)]),
+        np.concatenate([np.zeros((0, 2, 3), np.float32), *(part.covariances for part in parts)]),
+    )
+
+
+def noise_level(pairs: list[tuple[Image, Image]]) -> float:
+    """Estimate the standard deviation of the sensor noise from pairs of neighbouring images.
+
+    Most pixels of a pair show the same thing, so the median absolute difference is noise.
+
+    Returns:
+        Grey levels; at least half of one, which is rounding.
+    """
+    levels = []
+    for first, second in pairs:
+        difference = np.abs(first.astype(np.int16) - second.astype(np.int16))
+        # the median of integers is too coarse at low noise: interpolate its histogram
+        share = np.cumsum(np.bincount(difference.ravel(), minlength=2)) / difference.size
+        level = int(np.searchsorted(share, 0.5))
+        below = share[level - 1] if level else 0.0
+        median = level - 0.5 + (0.5 - below) / max(share[level] - below, 1e-12)
+        levels.append(1.4826 * max(median, 0.0) / np.sqrt(2))
+    return float(max(np.median(levels), 0.5)) if levels else 0.5
+
+
+def smooth(image: Image, params: MovingParams) -> Image:
+    """Return the image blurred against noise."""
+    import cv2
+
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), params.blur_px), dtype=np.uint8)
+
+
+def moving_edges(
+    image: Image,
+    others: tuple[Image, Image],
+    hand_pixel: Array,
+    hand_radius_px: float,
+    noise: float,
+    params: MovingParams,
+) -> FrameEdges:
+    """Find the edges of one image that move against the background to either partner.
+
+    Args:
+        image: (H, W) gray, smoothed; ``others``: its partners, likewise.
+        hand_pixel: (2,) where the hand's origin projects.
+        hand_radius_px: how far from there the tool can reach.
+        noise: of the raw images, grey levels.
+    """
+    import cv2
+
+    low = params.canny_low * max(noise, 1.0)
+    found = cv2.findNonZero(cv2.Canny(image, low, low * params.canny_ratio))
+    edges = np.zeros((0, 2), np.int32) if found is None else found.reshape(-1, 2)
+    edges = edges[matchable(edges, image.shape, params.block, params.search)]
+    affines = np.full((2, 2, 3), np.nan)
+    if len(edges) < _FLAT:
+        return _nothing(affines)
+    near = np.square(edges - hand_pixel).sum(axis=1) < hand_radius_px**2
+    changed = np.zeros(len(edges), dtype=bool)
+    for side, other in enumerate(others):
+        model = _background(image, other, edges, params)
+        if model is None:
+            return _nothing(affines)
+        affines[side] = model
+        changed |= _changed(image, other, model, noise, params)[edges[:, 1], edges[:, 0]]
+    edges = np.ascontiguousarray(edges[near & changed])
+    matches = [
+        match_blocks(
+            image,
+            other,
+            edges,
+            block=params.block,
+            search=params.search,
+            tau=params.tau,
+            alpha=params.alpha,
+        )
+        for other in others
+    ]
+    weights = [
+        mahalanobis(model, edges, match.translations, match.covariances)
+        for model, match in zip(affines, matches, strict=True)
+    ]
+    moving = np.maximum(*weights) > params.min_weight
+    return FrameEdges(
+        affines,
+        edges[moving].astype(np.uint16),
+        np.stack([match.translations[moving] for match in matches], axis=1).astype(np.int8),
+        np.stack([match.covariances[moving] for match in matches], axis=1).astype(np.float32),
+    )
+
+
+def _background(
+    image: Image, other: Image, edges: npt.NDArray[np.int32], params: MovingParams
+) -> Array | None:
+    """Fit the background's affine motion to a seeded sample of all edges."""
+    sample = edges
+    if len(edges) > params.background_edges:
+        rng = np.random.default_rng(params.seed)
+        rows = rng.choice(len(edges), params.background_edges, replace=False)
+        sample = np.ascontiguousarray(edges[np.sort(rows)])
+    matches = match_blocks(
+        image,
+        other,
+        sample,
+        block=params.block,
+        search=params.search,
+        tau=params.tau,
+        alpha=params.alpha,
+    )
+    fit = fit_background(sample, matches.translations, matches.covariances)
+    return None if fit is None else fit.model
+
+
+def _changed(
+    image: Image, other: Image, model: Array, noise: float, params: MovingParams
+) -> npt.NDArray[np.bool_]:
+    """Return (H, W) where the images differ after the background's motion is undone."""
+    import cv2
+
+    height, width = image.shape
+    corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], dtype=float)
+    shift = corners @ model.T - corners[:, :2]
+    if np.abs(shift).max() > 0.25:  # a still background needs no resampling, which blurs
+        other = np.asarray(
+            cv2.warpAffine(
+                other,
+                model,
+                (width, height),
+                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                borderMode=cv2.BORDER_REPLICATE,
+            ),
+            dtype=np.uint8,
+        )
+    difference = cv2.blur(cv2.absdiff(image, other), (3, 3))
+    spread = cv2.dilate(difference, np.ones((_CHANGE_REACH, _CHANGE_REACH), np.uint8))
+    return np.asarray(spread > max(params.change, 2.0 * noise))
+
+
+def _nothing(affines: Array) -> FrameEdges:
+    return FrameEdges(
+        affines,
+        np.zeros((0, 2), np.uint16),
+        np.zeros((0, 2, 2), np.int8),
+        np.zeros((0, 2, 3), np.float32),
+    )

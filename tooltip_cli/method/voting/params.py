@@ -1,0 +1,105 @@
+"""Parameters of the voting method; none of them is in the paper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class PairingParams:
+    """Which frames are looked at, and with which partners."""
+
+    frames: int = 200  # at most, spread over the hand's orientations
+    probe_radius: float = 0.15  # metres from the hand's origin: where a tool's end is expected
+    displacement_px: float = 4.5  # wanted motion of such points between partners
+    min_displacement_px: float = 2.0  # less shows nothing
+    max_displacement_px: float = 7.0  # more leaves the search window
+    max_gap: int = 15  # frames between partners
+
+
+@dataclass(frozen=True)
+class MovingParams:
+    """Which edges count as moving."""
+
+    block: int = 5  # pixels
+    search: int = 11  # pixels
+    tau: float = 80.0  # grey levels
+    alpha: float = 0.25  # px^2
+    blur_px: float = 1.0  # standard deviation of the Gaussian that tames sensor noise
+    canny_low: float = 20.0  # on the blurred image, at a noise of one grey level or less
+    canny_ratio: float = 2.5  # high threshold over low
+    background_edges: int = 2000  # sample that the background's motion is fitted to
+    change: float = 4.0  # grey levels that a pixel near a moving edge changes by, at least
+    min_weight: float = 2.0  # Mahalanobis distance to the background
+    reach: float = 0.35  # metres from the hand's origin: where the tool can be
+    seed: int = 0  # of the sample
+
+
+@dataclass(frozen=True)
+class VotingParams:
+    """How edges become points in the hand frame, and points an end."""
+
+    depths: int = 64  # samples of each edge's depth profile over the reach
+    clip: float = 6.0  # largest log-likelihood ratio that one partner may contribute
+    prediction_variance: float = 0.25  # px^2, error of the predicted motion
+    coarse: float = 0.008  # metres, voxels of the first vote
+    fine: float = 0.004  # metres, voxels of the second
+    min_score: float = 0.1  # share of expected frames that a voxel is seen in, first vote
+    volume_weight: float = 4.0  # log-volume against log-likelihood ratio in the choice of depth
+    rounds: int = 1  # of giving each edge a depth and voting again
+
+
+@dataclass(frozen=True)
+class EndParams:
+    """What counts as the tool's end; lengths in metres."""
+
+    voxel: float = 0.004
+    min_frames: float = 6.0  # that agree on a voxel, smoothed over neighbours
+    min_share: float = 0.12  # of what the tool's clearest voxels have
+    min_voxels: int = 8  # smaller pieces are specks
+    other_end_support: float = 0.5  # nor does one with less than this share of the first's support
+    other_end_share: float = 0.8  # another end nearer to the wrist than this share does not count
+    end_separation: float = 0.05  # an end is the farthest voxel within this distance
+    neighbourhood: float = 0.14  # of the far voxel, that its axis is found from
+    short_slab: float = 0.02  # the last stretch, that must be slender
+    wide: float = 0.08  # how far across the axis the short slab reaches
+    long_slab: float = 0.05  # the stretch whose direction is measured
+    slab_radius: float = 0.045  # how far across the axis the long slab reaches
+    cone_deg: float = 95.0  # the axis lies within this angle of grip-to-end
+    outwards_weight: float = 0.3  # preference for axes that point from the grip to the end
+    far_tolerance: float = 0.008  # the far voxel lies on the end face, to this
+    refine_deg: float = 8.0
+    face_cone_deg: float = 40.0
+    face_thickness: float = 0.0025
+    face_turn_weight: float = 0.6
+    face_gain: float = 1.3  # how much sharper an end face must be to turn the axis far
+    middle_slab: float = 0.012  # the stretch whose middle is the tip
+    side_quantile: float = 0.03  # what lies farther out does not make a side
+    surface_voxel: float = 0.003
+    surface_frames: int = 3
+
+
+@dataclass(frozen=True)
+class TrustParams:
+    """When an answer is refused, and how uncertain one is at least."""
+
+    min_frames: int = 30  # chosen frames
+    min_view_angle_deg: float = 15.0  # between the camera's directions, seen from the hand
+    min_score: float = 0.6  # best share of expected frames in which a voxel was seen
+    min_consistent: float = 0.55  # share of moving edges that fit something fixed to the hand
+    min_in_view: float = 0.5  # share of the frames in which the tip lies inside the image
+    halves: int = 6  # random halves of the frames that the end is found from again
+    seed: int = 0  # of the halves
+    floor: float = 0.0015  # metres, standard deviation that no number of frames removes
+    floor_per_radius: float = 0.1  # the same, for each metre of the end's radius
+
+
+@dataclass(frozen=True)
+class VotingSettings:
+    """Everything that an estimate by voting depends on."""
+
+    pairing: PairingParams = field(default_factory=PairingParams)
+    moving: MovingParams = field(default_factory=MovingParams)
+    voting: VotingParams = field(default_factory=VotingParams)
+    end: EndParams = field(default_factory=EndParams)
+    trust: TrustParams = field(default_factory=TrustParams)

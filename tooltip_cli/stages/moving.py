@@ -1,0 +1,226 @@
+"""The detect stage of the voting method: moving edges of frames paired by the hand's motion."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from tooltip_cli.errors import TooltipError
+from tooltip_cli.log.detections import read_provenance
+from tooltip_cli.log.edges import read_edges, write_edges
+from tooltip_cli.log.recording import Recording
+from tooltip_cli.log.views import Views
+from tooltip_cli.method.types import Array, Indices
+from tooltip_cli.method.voting.moving import (
+    FrameEdges,
+    Image,
+    MovingEdges,
+    join,
+    moving_edges,
+    noise_level,
+    smooth,
+)
+from tooltip_cli.method.voting.pairing import Pairing
+from tooltip_cli.method.voting.params import MovingParams
+from tooltip_cli.rig.camera import CameraModel
+from tooltip_cli.rig.kinematics import inverse_transform
+from tooltip_cli.stages.artifacts import (
+    artifact_path,
+    digest,
+    ensure_directory,
+    known_places,
+    provenance,
+    stage_key,
+)
+
+SUFFIX = ".edges.mcap"
+VERSION = 1
+_FRAMES_A_TASK = 16
+_NOISE_PAIRS = 8
+_LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class DetectedEdges:
+    """What the stage returns: the artifact and its content."""
+
+    path: Path
+    key: str
+    reused: bool
+    edges: MovingEdges
+
+
+def detect_edges_in(
+    recording: Recording,
+    views: Views,
+    pairing: Pairing,
+    params: MovingParams,
+    *,
+    out: Path | None = None,
+    force: bool = False,
+    jobs: int = 1,
+    on_frame: Callable[[], None] = lambda: None,
+) -> DetectedEdges:
+    """Find the moving edges of all chosen frames and write ``STEM.edges.mcap``, or reuse it.
+
+    It depends on the rig through the pairing and through where the hand is in the images.
+
+    Args:
+        jobs: threads; the result does not depend on them.
+        on_frame: called after every frame, for progress.
+
+    Raises:
+        TooltipError: an image cannot be decoded, or the artifact not written.
+    """
+    centres, radii = hand_in_image(views, pairing.frames, params.reach)
+    parents = {
+        "recording": recording.sha256,
+        "image_topic": recording.image_topic,
+        "frames": digest(pairing.frames),
+        "partners": digest(pairing.partners),
+        # to the pixel: what is looked at does not change with less
+        "hand": digest(np.round(np.column_stack([centres, radii]))),
+    }
+    key = stage_key("edges", VERSION, parents, params)
+    if not force:
+        for place in known_places(recording.path, SUFFIX, out):
+            stored = _stored(place, key, recording)
+            if stored is not None:
+                return DetectedEdges(place, key, True, stored)
+    edges = find_moving_edges(recording, views, pairing, params, jobs, on_frame)
+    path = artifact_path(recording.path, SUFFIX, out)
+    ensure_directory(path.parent)
+    write_edges(
+        path,
+        edges,
+        recording.image_stamps_ns,
+        recording.image_frame,
+        provenance(recording.path, recording.sha256, key, params),
+    )
+    return DetectedEdges(path, key, False, edges)
+
+
+def _stored(place: Path, key: str, recording: Recording) -> MovingEdges | None:
+    """Return the edges at a place if they have this key and are whole."""
+    origin = read_provenance(place)
+    if origin is None or origin.get("key") != key:
+        return None
+    try:
+        return read_edges(place, recording.image_stamps_ns)
+    except TooltipError:
+        _LOGGER.info("%s cannot be read and is made anew", place)
+        return None
+
+
+def find_moving_edges(
+    recording: Recording,
+    views: Views,
+    pairing: Pairing,
+    params: MovingParams,
+    jobs: int,
+    on_frame: Callable[[], None],
+) -> MovingEdges:
+    """Find the moving edges of all chosen frames; the result does not depend on ``jobs``."""
+    noise = _noise(recording, pairing)
+    parts: list[FrameEdges] = []
+    for part in _in_chunks(recording, views, pairing, noise, params, jobs):
+        parts.append(part)
+        on_frame()
+    return join(pairing.frames, pairing.partners, parts)
+
+
+def _noise(recording: Recording, pairing: Pairing) -> float:
+    """Estimate the sensor noise from chosen frames and their partners, evenly spread."""
+    rows = np.unique(np.linspace(0, len(pairing.frames) - 1, _NOISE_PAIRS).astype(int))
+    wanted = [i for row in rows for i in (pairing.frames[row], pairing.partners[row, 1])]
+    images = list(recording.images(wanted, gray=True))
+    return noise_level(list(zip(images[::2], images[1::2], strict=True)))
+
+
+def _in_chunks(
+    recording: Recording,
+    views: Views,
+    pairing: Pairing,
+    noise: float,
+    params: MovingParams,
+    jobs: int,
+) -> Iterator[FrameEdges]:
+    starts = iter(range(0, len(pairing.frames), _FRAMES_A_TASK))
+    with ThreadPoolExecutor(jobs) as pool:
+
+        def submit(count: int) -> list[Future[list[FrameEdges]]]:
+            return [
+                pool.submit(_chunk, recording, views, pairing, noise, params, start)
+                for start in islice(starts, count)
+            ]
+
+        pending = submit(jobs + 1)
+        try:
+            while pending:
+                yield from pending.pop(0).result()
+                pending += submit(1)
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+def _chunk(
+    recording: Recording,
+    views: Views,
+    pairing: Pairing,
+    noise: float,
+    params: MovingParams,
+    start: int,
+) -> list[FrameEdges]:
+    frames = pairing.frames[start : start + _FRAMES_A_TASK]
+    partners = pairing.partners[start : start + _FRAMES_A_TASK]
+    needed = np.unique(np.concatenate([frames, partners.ravel()]))
+    images: dict[int, Image] = {}
+    for index, image in zip(needed, recording.images(needed, gray=True), strict=True):
+        images[int(index)] = smooth(image, params)
+    centres, radii = hand_in_image(views, frames, params.reach)
+    return [
+        moving_edges(
+            images[int(frame)],
+            (images[int(before)], images[int(after)]),
+            centre,
+            float(radius),
+            noise,
+            params,
+        )
+        for frame, (before, after), centre, radius in zip(
+            frames, partners, centres, radii, strict=True
+        )
+    ]
+
+
+def hand_in_image(views: Views, frames: Indices, reach: float) -> tuple[Array, Array]:
+    """Return (F, 2) where the hand's origin projects and (F,) the reach around it, pixels."""
+    camera_from_hand = inverse_transform(views.hand_from_camera[frames])
+    origins = camera_from_hand[:, :3, 3]
+    ahead = np.maximum(origins[:, 2] - 0.5 * reach, 0.1)
+    radii = max(views.camera.fx, views.camera.fy) * reach / ahead
+    return views.camera.project(origins), radii
+
+
+def image_extent(camera: CameraModel) -> Array:
+    """Return (2, 2) the smallest and largest normalized coordinates seen, within 56 degrees."""
+    u = np.linspace(0, camera.width - 1, 33)
+    v = np.linspace(0, camera.height - 1, 33)
+    border = np.concatenate(
+        [
+            np.stack([u, np.zeros(33)], axis=1),
+            np.stack([u, np.full(33, camera.height - 1.0)], axis=1),
+            np.stack([np.zeros(33), v], axis=1),
+            np.stack([np.full(33, camera.width - 1.0), v], axis=1),
+        ]
+    )
+    rays = camera.directions(border)
+    normalized = np.clip(rays[:, :2] / np.maximum(rays[:, 2:], 1e-6), -1.5, 1.5)
+    return np.stack([np.nanmin(normalized, axis=0), np.nanmax(normalized, axis=0)])

@@ -1,0 +1,121 @@
+"""The estimate stage of the voting method: pair, detect, reconstruct, find the end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from tooltip_cli.log.recording import Recording
+from tooltip_cli.log.views import Views
+from tooltip_cli.method.rays import sphere_array
+from tooltip_cli.method.types import Array, Reason, TipEstimate, refused
+from tooltip_cli.method.voting.estimate import METHOD, check_motion, estimate_by_voting
+from tooltip_cli.method.voting.moving import MovingEdges
+from tooltip_cli.method.voting.pairing import Pairing, pair_frames
+from tooltip_cli.method.voting.params import VotingSettings
+from tooltip_cli.method.voting.volume import HandEdges
+from tooltip_cli.rig.camera import CameraModel
+from tooltip_cli.rig.kinematics import inverse_transform
+from tooltip_cli.stages.held_out import unlabelled
+from tooltip_cli.stages.moving import DetectedEdges, detect_edges_in, image_extent
+
+
+def pair_views(
+    views: Views, settings: VotingSettings, allowed: npt.NDArray[np.bool_]
+) -> tuple[Pairing, Array]:
+    """Return the pairing of a recording's images and (N, 4, 4) camera_from_hand."""
+    camera_from_hand = inverse_transform(views.hand_from_camera)
+    return pair_frames(camera_from_hand, _focal(views.camera), settings.pairing, allowed), (
+        camera_from_hand
+    )
+
+
+def vote(
+    recording: Recording,
+    views: Views,
+    settings: VotingSettings,
+    allowed: npt.NDArray[np.bool_],
+    *,
+    out: Path | None,
+    jobs: int,
+    on_frame: Callable[[], None],
+) -> tuple[TipEstimate, DetectedEdges | None]:
+    """Estimate the tip from the allowed images (N,); no edges where the motion shows nothing.
+
+    Raises:
+        TooltipError: an image cannot be decoded, or the edges not written.
+    """
+    pairing, camera_from_hand = pair_views(views, settings, allowed)
+    reason = check_motion(pairing, camera_from_hand, settings)
+    if reason is not None:
+        return refused(METHOD, len(pairing.frames), reason), None
+    detected = detect_edges_in(
+        recording, views, pairing, settings.moving, out=out, jobs=jobs, on_frame=on_frame
+    )
+    edges = hand_edges(views, detected.edges, camera_from_hand, settings)
+    spheres = sphere_array([(sphere.center, sphere.radius) for sphere in views.spheres])
+    return estimate_by_voting(edges, spheres, settings), detected
+
+
+def detect_for_voting(
+    recording: Recording,
+    views: Views,
+    settings: VotingSettings,
+    *,
+    out: Path | None = None,
+    force: bool = False,
+    jobs: int = 1,
+    on_frame: Callable[[], None] = lambda: None,
+) -> DetectedEdges | Reason:
+    """Find the moving edges that the estimate will ask for, or why the motion shows nothing.
+
+    Raises:
+        TooltipError: an image cannot be decoded, or the edges not written.
+    """
+    allowed = unlabelled(recording, views.camera, out)
+    pairing, camera_from_hand = pair_views(views, settings, allowed)
+    reason = check_motion(pairing, camera_from_hand, settings)
+    if reason is not None:
+        return reason
+    return detect_edges_in(
+        recording,
+        views,
+        pairing,
+        settings.moving,
+        out=out,
+        force=force,
+        jobs=jobs,
+        on_frame=on_frame,
+    )
+
+
+def hand_edges(
+    views: Views, moving: MovingEdges, camera_from_hand: Array, settings: VotingSettings
+) -> HandEdges:
+    """Undo the lens distortion of moving edges, their matches and the background's motion."""
+    camera = views.camera
+    pixels = moving.pixels.astype(float)
+    affines = moving.affines[moving.frame_of_edge]
+    carried = np.einsum("ekij,ej->eki", affines[..., :2], pixels) + affines[..., 2]
+    return HandEdges(
+        moving,
+        _normalized(camera, pixels),
+        _normalized(camera, pixels[:, None] + moving.translations),
+        _normalized(camera, carried),
+        camera_from_hand,
+        _focal(camera),
+        image_extent(camera),
+        settings.moving.reach,
+    )
+
+
+def _normalized(camera: CameraModel, pixels: Array) -> Array:
+    rays = camera.directions(pixels)
+    return np.asarray(rays[..., :2] / rays[..., 2:])
+
+
+def _focal(camera: CameraModel) -> float:
+    return float(np.sqrt(camera.fx * camera.fy))
