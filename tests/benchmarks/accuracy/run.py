@@ -6,7 +6,7 @@ Example:
     python tests/benchmarks/accuracy/run.py --work /tmp/accuracy --recordings DIR/*.mcap
 
 Simulated recordings are made once under ``--work`` and reused. A given recording needs
-STEM.rig.yaml, STEM.labels.csv and, for millimetres, STEM.truth.json beside it.
+STEM.labels.csv and, where it does not carry them, STEM.rig.yaml and STEM.truth.json beside it.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ def main() -> None:
     parser.add_argument("--recordings", nargs="*", type=Path, default=[])
     arguments = parser.parse_args()
     rows = []
-    cases = [(path, path.with_suffix(".rig.yaml"), "given") for path in arguments.recordings]
+    recordings = [path for path in arguments.recordings if len(path.suffixes) == 1]
+    cases = [(path, _rig_beside(path), "given") for path in recordings]
     if not arguments.recordings:
         cases = list(_simulated(arguments))
     for path, rig, group in cases:
@@ -74,6 +75,11 @@ def main() -> None:
             _summary(
                 group, method, [r for r in rows if (r["group"], r["method"]) == (group, method)]
             )
+
+
+def _rig_beside(path: Path) -> Path | None:
+    beside = path.with_suffix(".rig.yaml")
+    return beside if beside.exists() else None
 
 
 def _simulated(arguments: argparse.Namespace) -> Any:

@@ -1,7 +1,7 @@
 """The far end of what appears in the volume, and the tool's axis there.
 
 The farthest voxel from the wrist lies on the rim of a blunt end, so it only says where the end is.
-The axis is the direction in which the end is slender: the last two and the last five centimetres
+The axis is the direction in which the end is slender: the last three and the last five centimetres
 scatter least across it, and the tool stops sharply along it. The tip is the middle of the end
 across the axis, and the place where the density of points stops along it.
 """
@@ -39,7 +39,7 @@ class ToolEnd:
 
     position: Array  # (3,) metres, hand frame
     axis: Array  # (3,) unit vector, hand frame, out of the tool's end
-    radius: float  # metres, root mean square distance of its last 2 cm from the axis
+    radius: float  # metres, root mean square distance of its last 3 cm from the axis
     support: float  # frames that show the end's densest voxel over all chosen frames
 
 

@@ -61,7 +61,7 @@ class EndParams:
     other_end_share: float = 0.8  # another end nearer to the wrist than this share does not count
     end_separation: float = 0.05  # an end is the farthest voxel within this distance
     neighbourhood: float = 0.14  # of the far voxel, that its axis is found from
-    short_slab: float = 0.02  # the last stretch, that must be slender
+    short_slab: float = 0.03  # the last stretch, that must be slender
     wide: float = 0.08  # how far across the axis the short slab reaches
     long_slab: float = 0.05  # the stretch whose direction is measured
     slab_radius: float = 0.045  # how far across the axis the long slab reaches
