@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +26,7 @@ from tooltip_cli.stages.artifacts import (
     provenance,
     stage_key,
 )
+from tooltip_cli.stages.threads import in_order
 
 SUFFIX = ".detections.mcap"
 VERSION = 1
@@ -131,23 +130,8 @@ def _detect_pairs(
     recording: Recording, params: DetectorParams, jobs: int
 ) -> Iterator[TipDetection]:
     """Yield detections in frame order; chunks of pairs run on threads, a few ahead."""
-    starts = iter(range(0, len(recording.image_stamps_ns) - 1, _PAIRS_A_TASK))
-    with ThreadPoolExecutor(jobs) as pool:
-
-        def submit(count: int) -> list[Future[list[TipDetection]]]:
-            return [
-                pool.submit(_detect_chunk, recording, params, start)
-                for start in islice(starts, count)
-            ]
-
-        pending = submit(jobs + 1)
-        try:
-            while pending:
-                yield from pending.pop(0).result()
-                pending += submit(1)
-        finally:
-            for future in pending:
-                future.cancel()
+    starts = range(0, len(recording.image_stamps_ns) - 1, _PAIRS_A_TASK)
+    return in_order(lambda start: _detect_chunk(recording, params, start), starts, jobs)
 
 
 def _detect_chunk(recording: Recording, params: DetectorParams, start: int) -> list[TipDetection]:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +36,7 @@ from tooltip_cli.stages.artifacts import (
     provenance,
     stage_key,
 )
+from tooltip_cli.stages.threads import in_order
 
 SUFFIX = ".edges.mcap"
 VERSION = 1
@@ -129,7 +128,12 @@ def find_moving_edges(
     """Find the moving edges of all chosen frames; the result does not depend on ``jobs``."""
     noise = _noise(recording, pairing)
     parts: list[FrameEdges] = []
-    for part in _in_chunks(recording, views, pairing, noise, params, jobs):
+    starts = range(0, len(pairing.frames), _FRAMES_A_TASK)
+
+    def work(start: int) -> list[FrameEdges]:
+        return _chunk(recording, views, pairing, noise, params, start)
+
+    for part in in_order(work, starts, jobs):
         parts.append(part)
         on_frame()
     return join(pairing.frames, pairing.partners, parts)
@@ -141,33 +145,6 @@ def _noise(recording: Recording, pairing: Pairing) -> float:
     wanted = [i for row in rows for i in (pairing.frames[row], pairing.partners[row, 1])]
     images = list(recording.images(wanted, gray=True))
     return noise_level(list(zip(images[::2], images[1::2], strict=True)))
-
-
-def _in_chunks(
-    recording: Recording,
-    views: Views,
-    pairing: Pairing,
-    noise: float,
-    params: MovingParams,
-    jobs: int,
-) -> Iterator[FrameEdges]:
-    starts = iter(range(0, len(pairing.frames), _FRAMES_A_TASK))
-    with ThreadPoolExecutor(jobs) as pool:
-
-        def submit(count: int) -> list[Future[list[FrameEdges]]]:
-            return [
-                pool.submit(_chunk, recording, views, pairing, noise, params, start)
-                for start in islice(starts, count)
-            ]
-
-        pending = submit(jobs + 1)
-        try:
-            while pending:
-                yield from pending.pop(0).result()
-                pending += submit(1)
-        finally:
-            for future in pending:
-                future.cancel()
 
 
 def _chunk(
