@@ -74,6 +74,8 @@ def main(verbose: bool) -> None:
     """
     # OpenCV would print its own lines about damaged images beside ours; read when it is imported
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    # small products only: threads of the linear algebra would spin, and round differently
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.basicConfig(
         stream=sys.stderr,
         level=logging.INFO if verbose else logging.WARNING,

@@ -49,6 +49,7 @@ class Candidate:
     support: float  # share of the evidence that speaks for it, 0 to 1
     covariance: Array | None = None  # (3, 3) m^2; None: not known for this place
     axis: Array | None = None  # (3,) unit vector out of the tool's end, hand frame
+    axis_std: float | None = None  # rad, standard deviation of its direction either way
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ from tooltip_cli.stages.moving import DetectedEdges
 from tooltip_cli.stages.voting import vote
 
 SUFFIX = ".tip.json"
-VERSION = 1
+VERSION = 2
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -290,6 +290,8 @@ def tip_document(result: TipEstimate, origin: dict[str, Any]) -> dict[str, Any]:
             candidate["covariance_m2"] = plain(item.covariance)
         if item.axis is not None:
             candidate["axis"] = plain(item.axis)
+        if item.axis_std is not None:
+            candidate["axis_std_deg"] = float(np.degrees(item.axis_std))
         candidates.append(candidate)
     return {
         "status": result.status,
@@ -320,6 +322,7 @@ def estimate_from_document(document: dict[str, Any], path: Path) -> TipEstimate:
                     float(item["support"]),
                     _array(item.get("covariance_m2")),
                     _array(item.get("axis")),
+                    _radians(item.get("axis_std_deg")),
                 )
                 for item in document["candidates"]
             ),
@@ -330,6 +333,10 @@ def estimate_from_document(document: dict[str, Any], path: Path) -> TipEstimate:
         raise TooltipError(
             f"{path} is not a tip file ({error!r}); --force makes it anew"
         ) from error
+
+
+def _radians(degrees: float | None) -> float | None:
+    return None if degrees is None else float(np.radians(degrees))
 
 
 def _array(value: Any) -> npt.NDArray[np.float64] | None:
