@@ -17,7 +17,6 @@ with its body. All is measured again from where the end then is, until it stays.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -35,18 +34,19 @@ from tooltip_cli.method.voting.sight import (
 )
 from tooltip_cli.method.voting.volume import Cloud, HandEdges
 
-_SLABS = ((-0.010, 0.0), (-0.018, -0.010), (-0.026, -0.018))  # metres, behind the end's own
-_BEYOND_END = 0.003  # metres that the end's own slab reaches beyond it
+SLABS = ((-0.010, 0.0), (-0.018, -0.010), (-0.026, -0.018))  # metres, behind the end's own
+BEYOND_END = 0.003  # metres that the end's own slab reaches beyond it
 _FIRST_END_SLAB = 0.010  # metres, shrinking by
 _END_SLAB_STEP = 0.002  # in each round
 _LEAST_WIDTH = 0.010  # metres across, looked at about the thinnest tools
 _WIDTH_PER_RADIUS, _WIDTH_MARGIN = 1.8, 0.004
 _END_MARGIN = 0.002  # metres beyond the end's sides
 _MAX_STEP, _MAX_TURN = 0.005, 0.2  # metres and radians in one round
+_WIDE_ROUNDS = 2  # before the width at the end follows what was measured
 _SETTLED = 5e-5  # metres
 _SOLVER_STEPS = 8
-_STOP, _MIDDLE, _SIDE = 0, 1, 2  # kinds of equations
-_LINE = 7  # unknowns before the outlines: step (3), offset (2) and turn (2) of the midline
+_STOP, _MIDDLE, SIDE = 0, 1, 2  # kinds of equations
+LINE = 7  # unknowns before the outlines: step (3), offset (2) and turn (2) of the midline
 _TINY = 1e-8  # m^2, keeps the root of no width differentiable
 # metres and radians, standard deviations of what is expected before the frames are looked at
 _STEP_PRIOR, _OFFSET_PRIOR, _TURN_PRIOR, _RADIUS_PRIOR, _TAPER_PRIOR = (
@@ -67,7 +67,7 @@ class RefinedEnd:
 
 
 @dataclass(frozen=True)
-class _System:
+class System:
     """What was measured, as equations: linear in all unknowns but the outlines."""
 
     basis: Array  # (3, 2) across the axis
@@ -77,6 +77,8 @@ class _System:
     outline: Indices  # (R,) which one, or -1
     kinds: Indices  # (R,)
     frames: Indices  # (R,)
+    towards: Array  # (R, 3) hand frame: moving what is seen along it raises the target
+    places: Array  # (R,) metres along the axis from the end, of what is seen
     prior: Array  # (P, unknowns)
     prior_targets: Array  # (P,)
 
@@ -99,24 +101,33 @@ def refine_end(
         position: (3,) metres, hand frame; ``axis``: (3,) unit vector; ``radius``: metres.
         seed: of the resampling.
     """
-    near = near_edges(edges, cloud, position, params)
-    search = partial(_refine_from, near, radius=radius, params=params, seed=seed)
-    best = search(position, axis)
-    if best is None or best.agreement < params.good_agreement:
-        for turned in _about(axis, params.start_turn_deg):
-            found = search(position, turned)
-            if found is not None and (best is None or found.agreement > best.agreement):
-                best = found
-    if best is None or best.agreement < params.min_agreement:
+    found = best_fit(near_edges(edges, cloud, position, params), position, axis, radius, params)
+    return None if found is None else _resampled(found, params, seed)
+
+
+def best_fit(
+    near: NearEdges, position: Array, axis: Array, radius: float, params: RefineParams
+) -> Fit | None:
+    """Fit from the voted axis, from others where it leads nowhere, and at a point if it is one."""
+    best = fit_end(near, position, axis, radius, params)
+    if best is None or best.agreement(params) < params.good_agreement:
+        turned = [
+            fit_end(near, position, start, radius, params)
+            for start in _about(axis, params.start_turn_deg)
+        ]
+        fits = [fit for fit in (best, *turned) if fit is not None]
+        best = max(fits, key=lambda fit: fit.agreement(params), default=None)
+    if best is None or best.agreement(params) < params.min_agreement:
         return None
-    point = point_of(near, best.position, best.axis, _width(radius), params)
+    point = point_of(near, best.position, best.axis, looked_at(radius), params)
     if point is None:
         return best
-    pointed = search(best.position + point, best.axis, end_width=params.point_width)
-    return best if pointed is None or pointed.agreement < params.min_agreement else pointed
+    at_point = best.position + point
+    pointed = fit_end(near, at_point, best.axis, radius, params, params.point_width)
+    return best if pointed is None or pointed.agreement(params) < params.min_agreement else pointed
 
 
-def _width(radius: float) -> float:
+def looked_at(radius: float) -> float:
     """Return how far across the axis edges are looked at, metres."""
     return max(_WIDTH_PER_RADIUS * radius + _WIDTH_MARGIN, _LEAST_WIDTH)
 
@@ -130,99 +141,112 @@ def _about(axis: Array, degrees: float) -> Array:
     return np.asarray(np.cos(angle) * axis + np.sin(angle) * ring)
 
 
-def _refine_from(
+@dataclass(frozen=True)
+class Fit:
+    """The equations where the end stays, and their solution."""
+
+    system: System
+    unknowns: Array
+    loss: float  # metres, scale of the robust loss
+    position: Array  # (3,) metres, hand frame
+    axis: Array  # (3,) unit vector, hand frame
+    pixels_per_metre: float
+    end_width: float  # metres across, that was looked at
+
+    def agreement(self, params: RefineParams) -> float:
+        """Return the share of the frames' stops and middles that fit."""
+        residuals, _ = residuals_of(self.system, self.unknowns)
+        told = np.abs(residuals[self.system.kinds != SIDE])
+        return float(np.mean(told < 2.0 * params.loss_px / self.pixels_per_metre))
+
+
+def fit_end(
     near: NearEdges,
     start: Array,
     axis: Array,
-    *,
     radius: float,
     params: RefineParams,
-    seed: int,
     end_width: float | None = None,
-) -> RefinedEnd | None:
+) -> Fit | None:
     """Measure and solve until the end stays; None: too few frames, or it went elsewhere.
 
     Args:
         end_width: across, that is looked at about a pointed end; None: an end as any.
     """
     pixels = near.scale_at(start)
-    pointed, width, at = end_width is not None, _width(radius), start
+    pointed, width, at = end_width is not None, looked_at(radius), start
     end_width = width if end_width is None else end_width
     thinnest = max(params.end_slab, params.end_slab_px / pixels)
     loss, last_loss = params.first_loss_px / pixels, params.loss_px / pixels
-    outlines = np.tile([0.8 * radius, 0.0, 0.8 * radius], len(_SLABS) + 2)
+    outlines = np.tile([0.8 * radius, 0.0, 0.8 * radius], len(SLABS) + 2)
     for index in range(params.rounds):
         last = thinnest if pointed else _FIRST_END_SLAB - _END_SLAB_STEP * index
-        slabs = np.array([(-max(last, thinnest), _BEYOND_END), *_SLABS])
+        slabs = np.array([(-max(last, thinnest), BEYOND_END), *SLABS])
         sight = see(near, at, axis)
         measured = measure(near, sight, slabs, width, end_width, params)
         if np.isfinite(measured.stops).sum() < params.min_frames:
             return None
-        system = _equations(sight, measured, slabs, axis, radius, params)
-        unknowns = _solve(
-            system, np.concatenate([np.zeros(_LINE), outlines]), loss, params, _SOLVER_STEPS
+        system = equations(sight, measured, slabs, axis, radius, params)
+        unknowns = solve(
+            system, np.concatenate([np.zeros(LINE), outlines]), loss, params, _SOLVER_STEPS
         )
-        step, turn, outlines = unknowns[:3], system.basis @ unknowns[5:_LINE], unknowns[_LINE:]
+        step, turn, outlines = unknowns[:3], system.basis @ unknowns[5:LINE], unknowns[LINE:]
         at = at + _at_most(step, _MAX_STEP)
         axis = axis + _at_most(turn, _MAX_TURN)
         axis = axis / np.linalg.norm(axis)
-        halves = measured.halves[:, 0]
-        if pointed and np.isfinite(halves).any():
-            # as far as one thing goes: what stands beside a pin is left out
-            grown = float(np.nanmedian(halves)) + _END_MARGIN
-            end_width = min(width, max(grown, params.point_width))
-        elif index >= 2 and np.isfinite(halves).any():
-            end_width = min(width, 2.0 * float(np.nanquantile(halves, 0.9)) + _END_MARGIN)
+        end_width = _next_width(measured.halves[:, 0], end_width, width, pointed, index, params)
         if np.linalg.norm(step) < _SETTLED and loss <= last_loss:
             break
         loss = max(0.6 * loss, last_loss)
     if np.linalg.norm(at - start) > params.max_move:
         return None
-    return _summary(system, unknowns, loss, at, axis, pixels, params, seed)
+    return Fit(system, unknowns, loss, at, axis, pixels, end_width)
+
+
+def _next_width(
+    halves: Array, now: float, width: float, pointed: bool, index: int, params: RefineParams
+) -> float:
+    """Return how far across the end's own slab is looked at in the next round, metres."""
+    if not np.isfinite(halves).any():
+        return now
+    if pointed:  # as far as one thing goes: what stands beside a pin is left out
+        return min(width, max(float(np.nanmedian(halves)) + _END_MARGIN, params.point_width))
+    if index < _WIDE_ROUNDS:
+        return now
+    return min(width, 2.0 * float(np.nanquantile(halves, 0.9)) + _END_MARGIN)
 
 
 def _at_most(vector: Array, length: float) -> Array:
     return vector * min(1.0, length / max(float(np.linalg.norm(vector)), 1e-12))
 
 
-def _summary(
-    system: _System,
-    unknowns: Array,
-    loss: float,
-    position: Array,
-    axis: Array,
-    pixels: float,
-    params: RefineParams,
-    seed: int,
-) -> RefinedEnd:
+def _resampled(fit: Fit, params: RefineParams, seed: int) -> RefinedEnd:
     """Resample the frames (bootstrap) for the uncertainty."""
-    residuals, _ = _residuals(system, unknowns)
-    told = system.kinds != _SIDE
-    agreement = float(np.mean(np.abs(residuals[told]) < 2.0 * params.loss_px / pixels))
+    system, unknowns = fit.system, fit.unknowns
     rng = np.random.default_rng(seed)
     frames = int(system.frames.max()) + 1
-    samples = np.empty((params.resamplings, _LINE))
+    samples = np.empty((params.resamplings, LINE))
     for row in samples:
-        drawn = np.bincount(rng.integers(0, frames, frames), minlength=frames)
-        row[:] = (_solve(system, unknowns, loss, params, 2, drawn.astype(float)) - unknowns)[:_LINE]
+        drawn = np.bincount(rng.integers(0, frames, frames), minlength=frames).astype(float)
+        row[:] = (solve(system, unknowns, fit.loss, params, 2, drawn) - unknowns)[:LINE]
     return RefinedEnd(
-        position,
-        axis,
+        fit.position,
+        fit.axis,
         samples[:, :3].T @ samples[:, :3] / len(samples),
         float(np.square(samples[:, 5:]).mean()),
-        agreement,
-        pixels,
+        fit.agreement(params),
+        fit.pixels_per_metre,
     )
 
 
-def _equations(
+def equations(
     sight: Sight,
     measured: Measured,
     slabs: Array,
     axis: Array,
     radius: float,
     params: RefineParams,
-) -> _System:
+) -> System:
     basis = across_axis(axis)
     stopped = np.flatnonzero(np.isfinite(measured.stops))
     frame, slab = np.nonzero(np.isfinite(measured.middles))
@@ -236,14 +260,16 @@ def _equations(
     middle, half = measured.middles[frame, slab], measured.halves[frame, slab]
     outlines = len(slabs) + 1
     prior, prior_targets = _prior(outlines, radius, len(stopped) + len(frame), params)
-    return _System(
+    return System(
         basis,
         np.concatenate([measured.stops[stopped], middle, half + middle, half - middle]),
         np.concatenate([np.pad(stop_rows, ((0, 0), (0, 4))), lines, lines, -lines]),
         np.concatenate([stop_rows @ basis, across, across, across]),
         np.concatenate([np.zeros_like(stopped), np.full_like(slab, -1), 1 + slab, 1 + slab]),
-        np.repeat([_STOP, _MIDDLE, _SIDE], [len(stopped), len(frame), 2 * len(frame)]),
+        np.repeat([_STOP, _MIDDLE, SIDE], [len(stopped), len(frame), 2 * len(frame)]),
         np.concatenate([stopped, frame, frame, frame]),
+        np.concatenate([stop_rows, side_rows, side_rows, -side_rows]),
+        np.concatenate([np.zeros(len(stopped)), *[np.where(own, 0.0, place)[:, 0]] * 3]),
         prior,
         prior_targets,
     )
@@ -251,38 +277,38 @@ def _equations(
 
 def _prior(outlines: int, radius: float, count: int, params: RefineParams) -> tuple[Array, Array]:
     """Return weak equations that decide what frames leave open: rows, and what they should give."""
-    unknowns = _LINE + 3 * outlines
+    unknowns = LINE + 3 * outlines
     sigmas = np.repeat(
         [_STEP_PRIOR, _OFFSET_PRIOR, _TURN_PRIOR, _RADIUS_PRIOR, _TAPER_PRIOR],
         [3, 2, 2, 3, 3 * (outlines - 1)],
     )
     rows = np.eye(unknowns)
-    for column in range(_LINE + 3, unknowns):  # neighbouring outlines are alike
+    for column in range(LINE + 3, unknowns):  # neighbouring outlines are alike
         rows[column, column - 3] = -1.0
     targets = np.zeros(unknowns)
-    targets[[_LINE, _LINE + 2]] = radius
+    targets[[LINE, LINE + 2]] = radius
     weights = params.prior_weight * np.sqrt(count) / sigmas
     return rows * weights[:, None], targets * weights
 
 
-def _residuals(system: _System, unknowns: Array) -> tuple[Array, Array]:
+def residuals_of(system: System, unknowns: Array) -> tuple[Array, Array]:
     """Return (R,) residuals, metres, and (R, unknowns) the model's derivatives."""
-    root = unknowns[_LINE:].reshape(-1, 3)[system.outline]  # lower triangles
+    root = unknowns[LINE:].reshape(-1, 3)[system.outline]  # lower triangles
     u, w = system.seen_along.T
     first, second = root[:, 0] * u + root[:, 1] * w, root[:, 2] * w
     width = np.sqrt(first * first + second * second + _TINY)
     has = system.outline >= 0
     derivatives = np.zeros((len(u), len(unknowns)))
-    derivatives[:, :_LINE] = system.linear
+    derivatives[:, :LINE] = system.linear
     rows = np.flatnonzero(has)
     for offset, part in enumerate((first * u, first * w, second * w)):
-        derivatives[rows, _LINE + 3 * system.outline[rows] + offset] = (part / width)[rows]
-    residuals = system.targets - system.linear @ unknowns[:_LINE] - np.where(has, width, 0.0)
+        derivatives[rows, LINE + 3 * system.outline[rows] + offset] = (part / width)[rows]
+    residuals = system.targets - system.linear @ unknowns[:LINE] - np.where(has, width, 0.0)
     return residuals, derivatives
 
 
-def _solve(
-    system: _System,
+def solve(
+    system: System,
     unknowns: Array,
     loss: float,
     params: RefineParams,
@@ -295,21 +321,33 @@ def _solve(
         loss: scale of the robust loss, metres.
         frame_weights: (F,) how often each frame counts.
     """
-    side, middle = system.kinds == _SIDE, system.kinds == _MIDDLE
-    count = np.where(side, params.side_weight, 1.0)
-    if frame_weights is not None:
-        count = count * frame_weights[system.frames]
     for _ in range(steps):
-        residuals, derivatives = _residuals(system, unknowns)
-        weights = count / (loss**2 + np.square(residuals))
-        weights[side & (residuals < 0)] *= params.missed_weight
-        # where one side was missed, half the width is too small and the middle says nothing
-        odd = residuals[side].reshape(2, -1).mean(axis=0) / params.odd_width
-        weights[middle] /= np.square(1.0 + odd * odd)
-        weighted = derivatives * weights[:, None]
+        residuals, derivatives = residuals_of(system, unknowns)
+        weighted = (
+            derivatives * robust_weights(system, residuals, loss, params, frame_weights)[:, None]
+        )
         normal = weighted.T @ derivatives + system.prior.T @ system.prior
         right = weighted.T @ residuals + system.prior.T @ (
             system.prior_targets - system.prior @ unknowns
         )
         unknowns = unknowns + np.linalg.solve(normal + 1e-9 * np.eye(len(normal)), right)
     return unknowns
+
+
+def robust_weights(
+    system: System,
+    residuals: Array,
+    loss: float,
+    params: RefineParams,
+    frame_weights: Array | None = None,
+) -> Array:
+    """Return (R,) Cauchy weights of residuals (R,), metres."""
+    side, middle = system.kinds == SIDE, system.kinds == _MIDDLE
+    weights = np.where(side, params.side_weight, 1.0) / (loss**2 + np.square(residuals))
+    if frame_weights is not None:
+        weights *= frame_weights[system.frames]
+    weights[side & (residuals < 0)] *= params.missed_weight
+    # where one side was missed, half the width is too small and the middle says nothing
+    odd = residuals[side].reshape(2, -1).mean(axis=0) / params.odd_width
+    weights[middle] /= np.square(1.0 + odd * odd)
+    return np.asarray(weights)
