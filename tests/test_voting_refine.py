@@ -45,11 +45,14 @@ def outline(pose: Array, tip: Array, axis: Array, wide: float, high: float) -> A
 
 
 def seen(
-    parts: list[tuple[Array, Array, float, float]], seed: int, missing: float = 0.0
+    parts: list[tuple[Array, Array, float, float]],
+    seed: int,
+    missing: float = 0.0,
+    views: Array | None = None,
 ) -> tuple[HandEdges, Cloud]:
     """Return what is seen of bars; in a share of the frames, one side of them is missing."""
     rng = np.random.default_rng(seed)
-    views = poses(seed)
+    views = poses(seed) if views is None else views
     edges, rows = [], []
     for row, pose in enumerate(views):
         points = np.concatenate([outline(pose, *part) for part in parts])

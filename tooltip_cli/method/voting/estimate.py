@@ -81,6 +81,18 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     return TipEstimate(METHOD, first.position, first.covariance, tuple(candidates), reasons, used)
 
 
+def first_end(
+    edges: HandEdges, spheres: Array, settings: VotingSettings
+) -> tuple[Cloud, ToolEnd] | None:
+    """Return what was voted and its first end as the voxels give it; None: there is none."""
+    cloud = reconstruct(edges, settings.voting)
+    shape = tool_shape(cloud, spheres, edges.reach, settings.end)
+    ends = far_voxels(shape, settings.end)
+    if not len(ends):
+        return None
+    return cloud, locate_end(cloud, shape, shape.voxels[ends[0]], spheres, settings.end)
+
+
 def _candidate(
     edges: HandEdges,
     cloud: Cloud,

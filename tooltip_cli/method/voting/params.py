@@ -115,6 +115,20 @@ class RefineParams:
 
 
 @dataclass(frozen=True)
+class CalibrationParams:
+    """What corrections of clocks and camera are expected, and when one is made."""
+
+    time_prior: float = 0.03  # seconds, standard deviation of the clocks' offset
+    rotation_prior_deg: float = 1.0  # of the camera about each axis
+    translation_prior: float = 0.005  # metres, of the camera along each axis
+    rounds: int = 10
+    settled: float = 0.003  # of those deviations, smallest step worth another round
+    certain: float = 3.0  # standard deviations that an offset must have to be used
+    camera_gain: float = 0.05  # share of frames that must fit besides, for a camera's correction
+    determined: float = 0.33  # of those deviations, largest that still determines a direction
+
+
+@dataclass(frozen=True)
 class TrustParams:
     """When an answer is refused, and how uncertain one is at least."""
 
@@ -143,4 +157,5 @@ class VotingSettings:
     voting: VotingParams = field(default_factory=VotingParams)
     end: EndParams = field(default_factory=EndParams)
     refine: RefineParams = field(default_factory=RefineParams)
+    calibration: CalibrationParams = field(default_factory=CalibrationParams)
     trust: TrustParams = field(default_factory=TrustParams)

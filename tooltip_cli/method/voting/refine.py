@@ -116,7 +116,7 @@ def best_fit(
             for start in _about(axis, params.start_turn_deg)
         ]
         fits = [fit for fit in (best, *turned) if fit is not None]
-        best = max(fits, key=lambda fit: fit.agreement(params), default=None)
+        best = max(fits, key=lambda fit: fit.support(params), default=None)
     if best is None or best.agreement(params) < params.min_agreement:
         return None
     point = point_of(near, best.position, best.axis, looked_at(radius), params)
@@ -152,12 +152,24 @@ class Fit:
     axis: Array  # (3,) unit vector, hand frame
     pixels_per_metre: float
     end_width: float  # metres across, that was looked at
+    pointed: bool  # whether that is one thing beside others
+
+    frames: int  # that were looked at
 
     def agreement(self, params: RefineParams) -> float:
         """Return the share of the frames' stops and middles that fit."""
+        return float(np.mean(self._told(params) < 2.0))
+
+    def support(self, params: RefineParams) -> float:
+        """Return how well they fit, over how many there could be: little shown supports little."""
+        close = 1.0 / (1.0 + np.square(self._told(params)))
+        return float(close.sum() / (self.frames * (len(SLABS) + 2)))
+
+    def _told(self, params: RefineParams) -> Array:
+        """Return the stops' and middles' residuals in units of the robust loss."""
         residuals, _ = residuals_of(self.system, self.unknowns)
         told = np.abs(residuals[self.system.kinds != SIDE])
-        return float(np.mean(told < 2.0 * params.loss_px / self.pixels_per_metre))
+        return np.asarray(told * self.pixels_per_metre / params.loss_px)
 
 
 def fit_end(
@@ -200,7 +212,7 @@ def fit_end(
         loss = max(0.6 * loss, last_loss)
     if np.linalg.norm(at - start) > params.max_move:
         return None
-    return Fit(system, unknowns, loss, at, axis, pixels, end_width)
+    return Fit(system, unknowns, loss, at, axis, pixels, end_width, pointed, len(sight.scale))
 
 
 def _next_width(
