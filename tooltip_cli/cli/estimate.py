@@ -15,6 +15,7 @@ from tooltip_cli.cli.options import (
     jobs_option,
     json_option,
     out_option,
+    prefer_option,
     print_json,
     progress,
     recordings_argument,
@@ -48,6 +49,7 @@ from tooltip_cli.cli.options import (
     help="Find the offset of the image clock (time), and where the camera really is (all), from "
     "the same images, and use what clearly helps. 'tooltip calibrate' writes it as a rig file.",
 )
+@prefer_option
 @jobs_option
 @out_option
 @topic_options
@@ -59,6 +61,7 @@ def estimate(
     recordings: tuple[Path, ...],
     rig: Path | None,
     method: str,
+    prefer: tuple[float, float, float] | None,
     from_labels: Path | None,
     refine: str | None,
     jobs: int,
@@ -84,6 +87,7 @@ def estimate(
     """
     from tooltip_cli.log.recording import Topics
     from tooltip_cli.method.estimators import EstimatorParams
+    from tooltip_cli.method.voting.params import VotingSettings
     from tooltip_cli.stages.estimate import estimate as run
 
     if refine is not None and (method != "voting" or from_labels is not None):
@@ -97,7 +101,7 @@ def estimate(
                 path,
                 rig=rig,
                 topics=Topics(image=image, joints=joints, info=info, pose=pose),
-                params=EstimatorParams(method=method),
+                params=EstimatorParams(method=method, voting=VotingSettings(prefer=prefer)),
                 from_labels=from_labels,
                 refine=refine,
                 out=out,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -156,6 +157,33 @@ def progress(total: int | None, label: str) -> Iterator[Callable[[], None]]:
         if shown > start:
             sys.stderr.write("\r\x1b[K")
             sys.stderr.flush()
+
+
+class Direction(click.ParamType):  # type: ignore[type-arg]  # generic in newer click only
+    """A direction as three numbers, ``X,Y,Z``."""
+
+    name = "direction"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, float, float]:
+        """Return the three numbers."""
+        try:
+            x, y, z = (float(part) for part in value.split(","))
+        except ValueError:
+            self.fail(f"'{value}' is not three numbers like 0.1,0,0.2", param, ctx)
+        if not all(math.isfinite(part) for part in (x, y, z)) or not any((x, y, z)):
+            self.fail(f"'{value}' points nowhere", param, ctx)
+        return x, y, z
+
+
+prefer_option = click.option(
+    "--prefer",
+    type=Direction(),
+    metavar="X,Y,Z",
+    help="Of several ends (ambiguous_end), take the one farthest in this direction, hand frame; "
+    "its position in tip.json will do. For --method voting.",
+)
 
 
 def refinement_sentence(refined: dict[str, Any]) -> str:

@@ -71,14 +71,21 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
         _candidate(edges, cloud, shape, shape.voxels[far], spheres, settings)
         for far in far_voxels(shape, settings.end)
     ]
+    least = settings.end.other_end_support * candidates[0].support
+    candidates = [item for item in candidates if item.support >= least]
+    if settings.prefer is not None:
+        candidates = [preferred(candidates, np.array(settings.prefer))]
     first = candidates[0]
-    least = settings.end.other_end_support * first.support
-    candidates = [first, *(item for item in candidates[1:] if item.support >= least)]
     reason = _hidden(first.position, edges, trust)
     if reason is not None:
         return refused(METHOD, used, reason)
     reasons = () if len(candidates) == 1 else (_ambiguous(candidates),)
     return TipEstimate(METHOD, first.position, first.covariance, tuple(candidates), reasons, used)
+
+
+def preferred(candidates: list[Candidate], direction: Array) -> Candidate:
+    """Return the candidate that lies farthest in a direction (3,), hand frame."""
+    return max(candidates, key=lambda item: float(item.position @ direction))
 
 
 def first_end(
@@ -218,5 +225,6 @@ def _ambiguous(candidates: list[Candidate]) -> Reason:
     return Reason(
         "ambiguous_end",
         f"the tool has {len(candidates)} ends at nearly the same distance from the wrist; the "
-        f"farthest is given, the others are at {others} mm",
+        f"farthest is given, the others are at {others} mm; --prefer with one "
+        "of these as direction chooses",
     )

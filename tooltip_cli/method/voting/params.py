@@ -159,3 +159,6 @@ class VotingSettings:
     refine: RefineParams = field(default_factory=RefineParams)
     calibration: CalibrationParams = field(default_factory=CalibrationParams)
     trust: TrustParams = field(default_factory=TrustParams)
+    prefer: tuple[float, float, float] | None = (
+        None  # direction of the end that is meant, hand frame
+    )
