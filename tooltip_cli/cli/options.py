@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -20,6 +21,16 @@ PATH = click.Path(path_type=Path)
 METHODS = ("voting", "kmeans", "map")
 _PATIENCE_S = 1.0
 _RESULTS = (".detections.mcap", ".edges.mcap")
+
+
+def size_in_bytes(text: str) -> int:
+    """Return the bytes of a size such as 500MB, 1GB (powers of 1000) or 1GiB (of 1024)."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?", text.strip().lower())
+    if match is None:
+        raise click.BadParameter(f"'{text}' is no size; give one such as 500MB or 1GB")
+    number, prefix, binary = match.groups()
+    power = " kmgt".index(prefix or " ")
+    return int(float(number) * (1024 if binary else 1000) ** power)
 
 
 def recordings_argument(command: _Command) -> _Command:

@@ -24,8 +24,8 @@ from mcap.records import Attachment, Channel, Chunk, Footer, Schema
 from mcap.stream_reader import get_chunk_data_stream
 
 from tooltip_cli.errors import DamagedLogError, TooltipError
+from tooltip_cli.log.mcapfile import MAGIC
 
-MAGIC = b"\x89MCAP0\r\n"
 MAX_CHUNK_BYTES = 1 << 30
 _COMPRESSIONS = ("", "lz4", "zstd")
 _FRAME = struct.Struct("<BQ")  # opcode and length before every record

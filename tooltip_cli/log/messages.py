@@ -41,6 +41,7 @@ class Message:
     log_time_ns: int  # when it was received; orders the log, nothing else
     payload: bytes  # CDR with its four-byte encapsulation header
     publish_time_ns: int | None = None  # None: the same as log_time_ns
+    qos: str | None = None  # offered_qos_profiles as YAML; None: this program's default
 
 
 def definition(datatype: str) -> str:
