@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from tooltip_cli.errors import TooltipError
-from tooltip_cli.log.container import MAGIC, LoggedMessage, iterate, open_log
+from tooltip_cli.log.container import LoggedMessage, iterate, open_log
+from tooltip_cli.log.mcapfile import MAGIC
 from tooltip_cli.rig.documents import parse_yaml
 from tooltip_cli.sources.streams import missing_extra, one_line
 
