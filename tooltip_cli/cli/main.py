@@ -17,6 +17,7 @@ from tooltip_cli.errors import TooltipError
 # imported only when it is asked for, so that `--help` answers at once.
 COMMANDS = {
     "record": "Record or import images and joint angles into an MCAP log.",
+    "salvage": "Recover what is intact of a damaged recording.",
     "detect": "Find the tip's pixel in each frame by motion.",
     "estimate": "Find the 3D tip in the hand frame.",
     "evaluate": "Measure the estimate against hand labels and write a report.",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import re
 import sys
@@ -123,6 +124,17 @@ def topic_options(command: _Command) -> _Command:
             f"--{name}", metavar="TOPIC", help=f"Topic of the {what}, where there are several."
         )(command)
     return command
+
+
+def plural(count: int, noun: str) -> str:
+    """Return "1 image", "2 images"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def utc(stamp_ns: int) -> str:
+    """Return a time as people read it, to the millisecond."""
+    time = datetime.datetime.fromtimestamp(stamp_ns // 10**9, datetime.timezone.utc)
+    return f"{time:%Y-%m-%dT%H:%M:%S}.{stamp_ns // 10**6 % 1000:03}Z"
 
 
 def say(message: str) -> None:

@@ -109,25 +109,48 @@ def iterate(path: Path) -> Iterator[LoggedMessage | LoggedAttachment]:
         for opcode, offset, data in _records(file, path):
             try:
                 if opcode == Opcode.CHUNK:
-                    yield from _messages(unpack(chunk_head(memoryview(data))), offset, definitions)
+                    records = unpack(chunk_head(memoryview(data)))
+                    yield from chunk_messages(records, offset, definitions)
                 elif opcode == Opcode.ATTACHMENT:
                     attachment = read_attachment(data)
                     yield LoggedAttachment(attachment.name, attachment.media_type, attachment.data)
                 elif opcode == Opcode.MESSAGE:
-                    yield _message(data, 0, len(data), definitions, (-1, offset + FRAME.size))
+                    yield lone_message(data, offset, definitions)
                 else:
                     definitions.take(opcode, data)
             except RecordError as error:
                 raise _damaged(path, offset, str(error)) from error
 
 
-def _messages(records: bytes, offset: int, definitions: Definitions) -> Iterator[LoggedMessage]:
-    """Yield the messages of the chunk that starts at ``offset``."""
+def chunk_messages(
+    records: bytes, offset: int, definitions: Definitions
+) -> Iterator[LoggedMessage]:
+    """Yield the messages of a chunk, taking its definitions.
+
+    Args:
+        records: the chunk, unpacked.
+        offset: where it starts in the file.
+
+    Raises:
+        RecordError: it holds something else than whole records; earlier messages were whole.
+    """
     for opcode, start, length in inner_records(records):
         if opcode == Opcode.MESSAGE:
             yield _message(records, start, length, definitions, (offset, start))
         else:
             definitions.take(opcode, records[start : start + length])
+
+
+def lone_message(data: bytes, offset: int, definitions: Definitions) -> LoggedMessage:
+    """Return a message that stands outside chunks.
+
+    Args:
+        data: the content of its record, which starts at ``offset`` in the file.
+
+    Raises:
+        RecordError: it is none, or its channel is not defined.
+    """
+    return _message(data, 0, len(data), definitions, (-1, offset + FRAME.size))
 
 
 def _message(

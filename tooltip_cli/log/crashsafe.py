@@ -19,6 +19,7 @@ from typing import BinaryIO
 
 from tooltip_cli.errors import LowDiskError, TooltipError
 from tooltip_cli.log.messages import Message
+from tooltip_cli.log.whole import check_absent, disk_errors
 from tooltip_cli.log.writer import MessageWriter
 
 UNFINISHED = ".unfinished"
@@ -61,6 +62,7 @@ class CrashSafeWriter(MessageWriter):
         flush_every_s: float = FLUSH_EVERY_S,
     ) -> None:
         super().__init__(path, overwrite=overwrite)
+        self._overwrite = overwrite
         self._min_free, self._every = min_free_bytes, flush_every_s
         self._lock = threading.RLock()
         self._closing = threading.Event()
@@ -70,7 +72,7 @@ class CrashSafeWriter(MessageWriter):
         self._discarded = False
 
     def __enter__(self) -> CrashSafeWriter:
-        with self._disk_errors():
+        with disk_errors(self._path):
             self._check_space()
             if self._low is not None:
                 raise self._low
@@ -111,7 +113,7 @@ class CrashSafeWriter(MessageWriter):
         with self._writing():
             self._mcap.flush()
         # outside the lock: a slow disk must not keep anybody from writing
-        with self._disk_errors():
+        with disk_errors(self._path):
             os.fdatasync(self._file.fileno())
 
     def discard(self) -> None:
@@ -136,8 +138,9 @@ class CrashSafeWriter(MessageWriter):
                 return
             if self._failure is not None:
                 raise self._failure
-            with self._disk_errors():
-                self._check_absent()  # somebody else may have come first meanwhile
+            with disk_errors(self._path):
+                # somebody else may have come first meanwhile
+                check_absent(self._path, overwrite=self._overwrite)
                 self._unfinished.replace(self._path)
                 _sync_directory(self._path)
         finally:

@@ -90,11 +90,16 @@ class McapFile:
         return number
 
     def add_message(
-        self, channel: int, log_time_ns: int, publish_time_ns: int, payload: bytes
+        self,
+        channel: int,
+        log_time_ns: int,
+        publish_time_ns: int,
+        payload: bytes,
+        sequence: int | None = None,
     ) -> None:
-        """Append a message; sequence numbers count the messages of a channel from 1."""
-        sequence = self._sequences.get(channel, 0) + 1
-        self._sequences[channel] = sequence
+        """Append a message; ``sequence``: None counts the messages of a channel from 1."""
+        if sequence is None:
+            sequence = self._sequences[channel] = self._sequences.get(channel, 0) + 1
         head = _MESSAGE.pack(
             Opcode.MESSAGE,
             _MESSAGE_FIELDS + len(payload),

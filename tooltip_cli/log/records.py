@@ -10,18 +10,21 @@ import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
+from typing import TypeVar
 
 import lz4.frame
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Schema
+from mcap.records import Attachment, Channel, McapRecord, Schema
 
 MAX_CHUNK_BYTES = 1 << 27
 """Largest chunk that is read, packed or unpacked; writers make chunks of a few MiB at most."""
 MAX_RECORD_BYTES = 1 << 28
 """Largest other record that is read into memory; a message outside chunks may be a large image."""
+
+_Record = TypeVar("_Record", bound=McapRecord)
 
 FRAME = struct.Struct("<BQ")  # opcode and length before every record
 CRC = struct.Struct("<I")
@@ -72,16 +75,7 @@ def chunk_head(body: memoryview) -> ChunkHead:
     Raises:
         RecordError: it is too short, too large, or compressed in an unknown way.
     """
-    try:
-        start_ns, end_ns, size, crc, length = _CHUNK.unpack_from(body)
-        place = _CHUNK.size + min(length, 64)
-        compression = bytes(body[_CHUNK.size : place]).decode()
-        (packed,) = _LENGTH.unpack_from(body, place)
-    except (struct.error, UnicodeDecodeError) as error:
-        raise RecordError(f"a chunk cannot be unpacked ({error})") from error
-    place += _LENGTH.size
-    if compression not in _COMPRESSIONS or length != len(compression):
-        raise RecordError(f"a chunk is compressed with {compression!r}")
+    start_ns, end_ns, size, crc, compression, packed, place = _chunk_fields(body)
     if max(size, packed) > MAX_CHUNK_BYTES:
         raise RecordError(
             f"a chunk claims {max(size, packed)} bytes, more than {MAX_CHUNK_BYTES >> 20} MiB"
@@ -89,6 +83,40 @@ def chunk_head(body: memoryview) -> ChunkHead:
     if packed > len(body) - place:
         raise RecordError("a chunk ends before its data do")
     return ChunkHead(start_ns, end_ns, size, crc, compression, body[place : place + packed])
+
+
+def chunk_beginning(body: memoryview) -> bytes:
+    """Return as much of a chunk's records as the beginning of its record gives, unchecked.
+
+    Raises:
+        RecordError: not even its fields are there.
+    """
+    *_, compression, packed, place = _chunk_fields(body)
+    return _unpack_beginning(compression, body[place : place + packed])
+
+
+def chunk_length(beginning: bytes) -> int:
+    """Return the length of a chunk record's content by its own fields.
+
+    Raises:
+        RecordError: they are not there.
+    """
+    *_, packed, place = _chunk_fields(memoryview(beginning))
+    return place + packed
+
+
+def _chunk_fields(body: memoryview) -> tuple[int, int, int, int, str, int, int]:
+    """Return first and last time, size, CRC, compression, packed size, where the data start."""
+    try:
+        start_ns, end_ns, size, crc, length = _CHUNK.unpack_from(body)
+        place = _CHUNK.size + min(length, 64)
+        compression = bytes(body[_CHUNK.size : place]).decode()
+        (packed,) = _LENGTH.unpack_from(body, place)
+    except (struct.error, UnicodeDecodeError) as error:
+        raise RecordError(f"a chunk cannot be unpacked ({error})") from error
+    if compression not in _COMPRESSIONS or length != len(compression):
+        raise RecordError(f"a chunk is compressed with {compression!r}")
+    return start_ns, end_ns, size, crc, compression, packed, place + _LENGTH.size
 
 
 def unpack(chunk: ChunkHead) -> bytes:
@@ -122,8 +150,7 @@ def _unpacked(chunk: ChunkHead) -> bytes:
     return bytes(chunk.data)
 
 
-def unpack_beginning(compression: str, data: memoryview) -> bytes:
-    """Return as much of a chunk's records as a part of its data gives, unchecked."""
+def _unpack_beginning(compression: str, data: memoryview) -> bytes:
     if compression == "lz4":
         frame = lz4.frame.LZ4FrameDecompressor()
         try:
@@ -163,6 +190,19 @@ def inner_records(records: bytes) -> Iterator[tuple[int, int, int]]:
         position += length
 
 
+def parsed(kind: type[_Record], data: bytes) -> _Record:
+    """Return a small record of one of the library's kinds.
+
+    Raises:
+        RecordError: the bytes are not one.
+    """
+    try:
+        record: _Record = kind.read(ReadDataStream(BytesIO(data)))  # type: ignore[attr-defined]
+    except (McapError, struct.error, ValueError) as error:
+        raise RecordError(f"a record cannot be read ({error!r})") from error
+    return record
+
+
 def read_attachment(data: bytes) -> Attachment:
     """Return an attachment whose CRC holds.
 
@@ -170,15 +210,11 @@ def read_attachment(data: bytes) -> Attachment:
         RecordError: it does not, or it is no attachment.
     """
     if len(data) < CRC.size:
-        raise RecordError("a record cannot be read (an attachment without a CRC)")
+        raise RecordError("a record cannot be read (an attachment that is too short)")
     (stored,) = CRC.unpack_from(data, len(data) - CRC.size)
     if stored and zlib.crc32(memoryview(data)[: -CRC.size]) != stored:
         raise RecordError("an attachment fails its CRC")
-    try:
-        attachment: Attachment = Attachment.read(_stream(data))
-    except (McapError, struct.error, ValueError) as error:
-        raise RecordError(f"a record cannot be read ({error!r})") from error
-    return attachment
+    return parsed(Attachment, data)
 
 
 class Definitions:
@@ -189,6 +225,13 @@ class Definitions:
         self._channels: dict[int, Channel] = {}
         self._known: dict[int, LoggedChannel] = {}
         self._bodies: dict[tuple[int, int], bytes] = {}
+
+    def copy(self) -> Definitions:
+        """Return the same definitions, to which others can be added."""
+        other = Definitions()
+        other._schemas, other._channels = dict(self._schemas), dict(self._channels)
+        other._known, other._bodies = dict(self._known), dict(self._bodies)
+        return other
 
     def take(self, opcode: int, body: bytes) -> None:
         """Remember a schema or a channel; other records are ignored.
@@ -205,15 +248,12 @@ class Definitions:
                 kind = "schema" if opcode == Opcode.SCHEMA else "channel"
                 raise RecordError(f"{kind} {key[1]} is defined twice, differently")
             return
-        try:
-            if opcode == Opcode.SCHEMA:
-                schema = Schema.read(_stream(body))
-                self._schemas[schema.id] = LoggedSchema(schema.name, schema.encoding, schema.data)
-            else:
-                channel = Channel.read(_stream(body))
-                self._channels[channel.id] = channel
-        except (McapError, struct.error, ValueError) as error:
-            raise RecordError(f"a record cannot be read ({error!r})") from error
+        if opcode == Opcode.SCHEMA:
+            schema = parsed(Schema, body)
+            self._schemas[schema.id] = LoggedSchema(schema.name, schema.encoding, schema.data)
+        else:
+            channel = parsed(Channel, body)
+            self._channels[channel.id] = channel
         self._bodies[key] = body
 
     def channel(self, number: int) -> LoggedChannel:
@@ -233,7 +273,3 @@ class Definitions:
             )
             self._known[number] = known
         return known
-
-
-def _stream(data: bytes) -> ReadDataStream:
-    return ReadDataStream(BytesIO(data))

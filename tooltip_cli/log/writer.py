@@ -7,8 +7,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
@@ -21,8 +19,7 @@ from tooltip_cli.errors import TooltipError
 from tooltip_cli.log.mcapfile import McapFile
 from tooltip_cli.log.messages import Message, schema_text
 from tooltip_cli.log.qos import default_qos
-
-_IN_PROGRESS = ".partial"
+from tooltip_cli.log.whole import check_absent, disk_errors, whole_file
 
 
 class MessageWriter:
@@ -30,14 +27,12 @@ class MessageWriter:
 
     _mcap: McapFile
 
-    def __init__(self, path: Path, *, overwrite: bool) -> None:
+    def __init__(self, path: Path, *, overwrite: bool = False) -> None:
         self._path = path
-        self._overwrite = overwrite
         self._channels: dict[str, int] = {}
         self._types: dict[str, str] = {}
         self._schemas: dict[str, int] = {}
-        with self._disk_errors():
-            self._check_absent()
+        check_absent(path, overwrite=overwrite)
 
     def write(self, message: Message) -> None:
         """Append a message; a topic keeps the type and the QoS of its first message.
@@ -70,11 +65,7 @@ class MessageWriter:
 
     def _writing(self) -> AbstractContextManager[None]:
         """Surround everything that touches the file."""
-        return self._disk_errors()
-
-    def _check_absent(self) -> None:
-        if self._path.exists() and not self._overwrite:
-            raise TooltipError(f"{self._path} exists; give another name, or --force to replace it")
+        return disk_errors(self._path)
 
     def _channel(self, message: Message) -> int:
         topic, datatype = message.topic, message.datatype
@@ -97,13 +88,6 @@ class MessageWriter:
         )
         return self._channels[topic]
 
-    @contextlib.contextmanager
-    def _disk_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise TooltipError(f"{self._path}: cannot be written ({error.strerror})") from error
-
 
 class LogWriter(MessageWriter):
     """Writes one MCAP file whole or not at all.
@@ -115,18 +99,12 @@ class LogWriter(MessageWriter):
         TooltipError: the file exists and ``overwrite`` is false, or cannot be written.
     """
 
-    def __init__(self, path: Path, *, overwrite: bool = False) -> None:
-        super().__init__(path, overwrite=overwrite)
-        self._temporary = path.with_name(f".{path.name}.{os.getpid()}{_IN_PROGRESS}")
-
     def __enter__(self) -> LogWriter:
-        with self._disk_errors():
-            self._file: BinaryIO = self._temporary.open("wb", buffering=0)
-            try:
-                self._start(self._file)
-            except OSError:
-                self._discard()
-                raise
+        with contextlib.ExitStack() as stack:
+            file = stack.enter_context(whole_file(self._path))
+            with self._writing():
+                self._start(file)
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(
@@ -135,17 +113,8 @@ class LogWriter(MessageWriter):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        try:
-            if kind is None:
-                with self._disk_errors():
-                    self._mcap.finish()
-                    os.fsync(self._file.fileno())
-                    self._file.close()
-                    self._temporary.replace(self._path)
-        finally:
-            self._discard()
-
-    def _discard(self) -> None:
-        self._file.close()
-        with contextlib.suppress(OSError):
-            self._temporary.unlink()
+        with self._stack:
+            if error is not None:
+                raise error  # for the file to see it, and to leave nothing
+            with self._writing():
+                self._mcap.finish()
