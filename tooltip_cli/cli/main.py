@@ -11,12 +11,14 @@ from typing import Any
 import click
 
 from tooltip_cli import __version__
+from tooltip_cli.cli.options import printable
 from tooltip_cli.errors import TooltipError
 
 # Name -> one line for `tooltip --help`. Each command lives in the module of its name and is
 # imported only when it is asked for, so that `--help` answers at once.
 COMMANDS = {
     "record": "Record or import images and joint angles into an MCAP log.",
+    "info": "Say what a recording holds, and what is wrong with it.",
     "salvage": "Recover what is intact of a damaged recording.",
     "detect": "Find the tip's pixel in each frame by motion.",
     "estimate": "Find the 3D tip in the hand frame.",
@@ -51,13 +53,8 @@ class LazyGroup(click.Group):
         try:
             return super().invoke(ctx)
         except TooltipError as error:
-            click.echo(f"Error: {_printable(str(error))}", err=True)
+            click.echo(f"Error: {printable(str(error))}", err=True)
             ctx.exit(error.exit_code)
-
-
-def _printable(text: str) -> str:
-    """Return text on one line; names out of a log may hold line breaks and terminal codes."""
-    return "".join(char if char.isprintable() else " " for char in text)
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})

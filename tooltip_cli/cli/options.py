@@ -137,6 +137,24 @@ def utc(stamp_ns: int) -> str:
     return f"{time:%Y-%m-%dT%H:%M:%S}.{stamp_ns // 10**6 % 1000:03}Z"
 
 
+def printable(text: str) -> str:
+    """Return text on one line; names out of a log may hold line breaks and terminal codes."""
+    return "".join(char if char.isprintable() else " " for char in text)
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> list[str]:
+    """Return the lines of a table; the first ``left`` columns begin at the left."""
+    cells = [[printable(cell) for cell in row] for row in (heads, *rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if column < left else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in cells
+    ]
+
+
 def say(message: str) -> None:
     """Write a message for the person at the terminal."""
     click.echo(message, err=True)

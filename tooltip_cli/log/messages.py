@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import re
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -122,6 +123,14 @@ def time_from_ns(stamp_ns: int) -> dict[str, int]:
 def ns_from_time(time: Any) -> int:
     """Return integer nanoseconds for a decoded ``builtin_interfaces/Time``."""
     return int(time.sec) * 1_000_000_000 + int(time.nanosec)
+
+
+def header_stamp_ns(payload: bytes) -> int | None:
+    """Return the stamp of a message that begins with a std_msgs/Header; None: it is too short."""
+    if len(payload) < 12:
+        return None
+    sec, nanosec = struct.unpack_from("<iI" if payload[1] & 1 else ">iI", payload, 4)
+    return int(sec) * 1_000_000_000 + int(nanosec)
 
 
 def header(stamp_ns: int, frame_id: str = "") -> dict[str, Any]:

@@ -129,11 +129,18 @@ def _payload(
     return cache[chunk_offset][offset : offset + length]
 
 
-def read_recording(path: Path, topics: Topics = Topics()) -> Recording:
+def read_recording(
+    path: Path,
+    topics: Topics = Topics(),
+    items: Iterable[LoggedMessage | LoggedAttachment] | None = None,
+) -> Recording:
     """Read one log: all small streams into memory, images as places in the file.
 
     What not every stage needs (joints, intrinsics, poses, robot) and cannot be taken is left out,
     and ``unusable`` says why, unless its topic was asked for by name.
+
+    Args:
+        items: what is left of a damaged file; default: the file, which must be whole.
 
     Raises:
         TooltipError: not a readable MCAP log; no image topic or several; a named topic that is
@@ -141,7 +148,7 @@ def read_recording(path: Path, topics: Topics = Topics()) -> Recording:
         DamagedLogError: truncated, or a checksum fails.
     """
     index = _Index(path)
-    for item in iterate(path):
+    for item in iterate(path) if items is None else items:
         index.add(item)
     image_topic = index.image_topic(topics.image)
     stamps, places, frame = index.image_stream(image_topic)
@@ -386,17 +393,16 @@ def _read_header(item: LoggedMessage, path: Path) -> tuple[int, str]:
 
     Decoding the whole message would copy every image twice.
     """
+    stamp_ns = messages.header_stamp_ns(item.payload)
     try:
         order: Literal["little", "big"] = "little" if item.payload[1] & 1 else "big"
-        seconds = int.from_bytes(item.payload[4:8], order, signed=True)
-        nanoseconds = int.from_bytes(item.payload[8:12], order)
         length = int.from_bytes(item.payload[12:16], order)
         frame = item.payload[16 : 16 + max(length - 1, 0)].decode("utf-8")
-        if len(item.payload) < 16 + length:
+        if stamp_ns is None or len(item.payload) < 16 + length:
             raise ValueError("too short")
     except (IndexError, ValueError) as error:
         raise TooltipError(
             f"{path}: a message on {item.topic} is not a {item.datatype}; record it again, or "
             "leave the topic out"
         ) from error
-    return seconds * 1_000_000_000 + nanoseconds, frame
+    return stamp_ns, frame

@@ -160,6 +160,15 @@ def recovered(
                 tally.gap(Gap(part.offset, part.length, reason), definitions)
 
 
+def readable(found: Survey) -> Iterator[LoggedMessage | LoggedAttachment]:
+    """Yield what is left of a file as :func:`iterate` does of one that is whole."""
+    for item in recovered(found):
+        if isinstance(item, Attachment):
+            yield LoggedAttachment(item.name, item.media_type, item.data)
+        elif isinstance(item, LoggedMessage):
+            yield item
+
+
 def _messages(
     part: Part, data: bytes, definitions: Definitions, trusted: bool
 ) -> Iterator[LoggedMessage]:

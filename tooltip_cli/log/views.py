@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tooltip_cli.errors import TooltipError
-from tooltip_cli.log.recording import Recording
+from tooltip_cli.log.recording import JointTrack, Recording
 from tooltip_cli.log.sync import bracket, interpolate, interpolate_poses
 from tooltip_cli.rig.camera import CameraModel
 from tooltip_cli.rig.kinematics import (
@@ -119,7 +119,7 @@ def _check_image_size(recording: Recording, camera: CameraModel) -> None:
 
 
 def _from_joints(recording: Recording, rig: Rig, query_ns: Stamps) -> Array:
-    chain = _chain(recording, rig)
+    chain = resolve_chain(recording, rig)
     if not recording.joints:
         raise TooltipError(
             recording.unusable.get("joints")
@@ -127,11 +127,7 @@ def _from_joints(recording: Recording, rig: Rig, query_ns: Stamps) -> Array:
             "hand's pose is unknown; if it logs poses, name them under hand.pose_topic in the rig "
             "file"
         )
-    # a name that the rig maps stands for the URDF's joint alone
-    tracks = {name: track for name, track in recording.joints.items() if name not in rig.joints}
-    for logged, name in rig.joints.items():
-        if logged in recording.joints:
-            tracks[name] = recording.joints[logged]
+    tracks = urdf_tracks(recording, rig)
     _check_joints(recording, rig, chain.joint_names, tracks)
     needed = {name: tracks[name] for name in chain.joint_names}
     _check_overlap(
@@ -144,7 +140,22 @@ def _from_joints(recording: Recording, rig: Rig, query_ns: Stamps) -> Array:
     return chain.hand_from_camera(np.stack(positions, axis=1))
 
 
-def _chain(recording: Recording, rig: Rig) -> KinematicChain:
+def urdf_tracks(recording: Recording, rig: Rig) -> dict[str, JointTrack]:
+    """Return the logged joints by their names in the URDF."""
+    # a name that the rig maps stands for the URDF's joint alone
+    tracks = {name: track for name, track in recording.joints.items() if name not in rig.joints}
+    for logged, name in rig.joints.items():
+        if logged in recording.joints:
+            tracks[name] = recording.joints[logged]
+    return tracks
+
+
+def resolve_chain(recording: Recording, rig: Rig) -> KinematicChain:
+    """Return the chain from the camera to the hand, by the rig's URDF or else the log's.
+
+    Raises:
+        TooltipError: there is none, or it lacks a frame.
+    """
     urdf = rig.urdf if rig.urdf is not None else recording.urdf
     if urdf is None:
         raise TooltipError(

@@ -129,6 +129,18 @@ class KinematicChain:
             )
         return chain
 
+    @property
+    def limits(self) -> Array:
+        """(J, 2) lowest and highest position of each joint, rad or m; infinite where none is."""
+        limits = np.full((len(self.joint_names), 2), (-np.inf, np.inf))
+        for row, (column, size) in enumerate(self._columns):
+            if size == 1:
+                limits[row] = (
+                    self._model.lowerPositionLimit[column],
+                    self._model.upperPositionLimit[column],
+                )
+        return limits
+
     def hand_from_camera(self, positions: npt.ArrayLike) -> Array:
         """Return the transform T_c of the paper for each configuration.
 
