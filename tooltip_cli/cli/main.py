@@ -24,6 +24,7 @@ COMMANDS = {
     "estimate": "Find the 3D tip in the hand frame.",
     "evaluate": "Measure the estimate against hand labels and write a report.",
     "compare": "Compare reports, frame by frame.",
+    "export": "Write the result for viewers and robots.",
     "demo": "Simulate recordings and take them through every stage.",
 }
 

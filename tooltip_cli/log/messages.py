@@ -26,6 +26,8 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 STRING = "std_msgs/msg/String"
 IMAGE_ANNOTATIONS = "foxglove_msgs/msg/ImageAnnotations"
+SCENE_UPDATE = "foxglove_msgs/msg/SceneUpdate"
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 TIP_DETECTION = "tooltip_msgs/msg/TipDetection"
 MOVING_EDGES = "tooltip_msgs/msg/MovingEdges"
 

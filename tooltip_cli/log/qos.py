@@ -17,7 +17,7 @@ import yaml
 
 _UNLIMITED = (0, 0)
 _TRANSIENT_LOCAL, _VOLATILE = 1, 2
-_LATCHED = ("robot_description", "tf_static")
+_LATCHED = ("robot_description", "tf_static", "scene")
 
 
 @dataclass(frozen=True)

@@ -26,12 +26,11 @@ from tooltip_cli.log.container import (
     iterate,
     lone_message,
 )
+from tooltip_cli.log.copier import Copier
 from tooltip_cli.log.mcapfile import McapFile
 from tooltip_cli.log.records import (
     FRAME,
     Definitions,
-    LoggedChannel,
-    LoggedSchema,
     RecordError,
     chunk_beginning,
     chunk_head,
@@ -187,13 +186,12 @@ def _messages(
 
 
 class _Target:
-    """The recovered file; foreign schemas, channels and sequence numbers pass as they are."""
+    """The recovered file."""
 
     def __init__(self, mcap: McapFile) -> None:
         self.mcap = mcap
         self.digests: dict[str, int] = {}  # CRC of all payloads, by topic
-        self._schemas: dict[LoggedSchema, int] = {}
-        self._channels: dict[int, tuple[LoggedChannel, int]] = {}  # by identity
+        self._copier = Copier(mcap)
 
     def take(self, item: LoggedMessage | Attachment | Metadata) -> None:
         if isinstance(item, Attachment):
@@ -203,30 +201,7 @@ class _Target:
         else:
             digest = self.digests.get(item.topic, 0)
             self.digests[item.topic] = zlib.crc32(item.payload, digest)
-            self.mcap.add_message(
-                self._channel(item.channel),
-                item.log_time_ns,
-                item.publish_time_ns,
-                item.payload,
-                item.sequence,
-            )
-
-    def _channel(self, channel: LoggedChannel) -> int:
-        known = self._channels.get(id(channel))
-        if known is None:
-            schema = channel.schema
-            if schema is not None and schema not in self._schemas:
-                number = self.mcap.add_schema(schema.name, schema.encoding, schema.text)
-                self._schemas[schema] = number
-            number = self.mcap.add_channel(
-                channel.topic,
-                channel.encoding,
-                self._schemas[schema] if schema is not None else 0,
-                channel.metadata,
-            )
-            # kept with its number, so that no other channel gets the same identity
-            known = self._channels[id(channel)] = channel, number
-        return known[1]
+            self._copier.copy(item)
 
 
 @dataclass

@@ -150,21 +150,31 @@ def urdf_tracks(recording: Recording, rig: Rig) -> dict[str, JointTrack]:
     return tracks
 
 
+def resolve_urdf(recording: Recording, rig: Rig) -> tuple[str, str]:
+    """Return the robot description, the rig's or else the log's, and what to call it.
+
+    Raises:
+        TooltipError: there is none.
+    """
+    if rig.urdf is not None:
+        return rig.urdf, rig.source
+    if recording.urdf is None:
+        raise TooltipError(
+            recording.unusable.get("robot")
+            or f"{recording.path} has no /robot_description; name the URDF under 'robot' in "
+            f"{rig.source}"
+        )
+    return recording.urdf, f"{recording.path}: /robot_description"
+
+
 def resolve_chain(recording: Recording, rig: Rig) -> KinematicChain:
     """Return the chain from the camera to the hand, by the rig's URDF or else the log's.
 
     Raises:
         TooltipError: there is none, or it lacks a frame.
     """
-    urdf = rig.urdf if rig.urdf is not None else recording.urdf
-    if urdf is None:
-        raise TooltipError(
-            recording.unusable.get("robot")
-            or f"{recording.path} has no /robot_description; name the URDF under 'robot' in "
-            f"{rig.source}"
-        )
+    urdf, source = resolve_urdf(recording, rig)
     camera_frame = rig.camera_frame or recording.image_frame
-    source = rig.source if rig.urdf is not None else f"{recording.path}: /robot_description"
     return KinematicChain.from_urdf(urdf, camera_frame, rig.hand_frame, rig.mount, source)
 
 

@@ -16,6 +16,8 @@ from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 
 from tooltip_cli import __version__
 from tooltip_cli.errors import TooltipError
+from tooltip_cli.log.container import LoggedMessage
+from tooltip_cli.log.copier import Copier
 from tooltip_cli.log.mcapfile import McapFile
 from tooltip_cli.log.messages import Message, schema_text
 from tooltip_cli.log.qos import default_qos
@@ -50,6 +52,11 @@ class MessageWriter:
                 message.payload,
             )
 
+    def copy(self, message: LoggedMessage) -> None:
+        """Append a message of another log with its own definition and QoS."""
+        with self._writing():
+            self._copier.copy(message)
+
     def attach(self, name: str, media_type: str, data: bytes, stamp_ns: int = 0) -> None:
         """Append an attachment."""
         with self._writing():
@@ -62,6 +69,7 @@ class MessageWriter:
 
     def _start(self, file: BinaryIO) -> None:
         self._mcap = McapFile(file, profile=Profile.ROS2, library=f"tooltip-cli/{__version__}")
+        self._copier = Copier(self._mcap)
 
     def _writing(self) -> AbstractContextManager[None]:
         """Surround everything that touches the file."""
