@@ -12,7 +12,7 @@ import contextlib
 import os
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
@@ -69,7 +69,7 @@ class CrashSafeWriter(MessageWriter):
         self._failure: TooltipError | None = None
         self._low: LowDiskError | None = None
         self._checked_bytes = 0
-        self._discarded = False
+        self._begun = self._discarded = False
 
     def __enter__(self) -> CrashSafeWriter:
         with disk_errors(self._path):
@@ -103,6 +103,10 @@ class CrashSafeWriter(MessageWriter):
         if self._low is not None:
             raise self._low
         super().write(message)
+        if not self._begun:
+            # at once, so that even the shortest recording is not an empty file
+            self._begun = True
+            self.flush()
 
     def flush(self) -> None:
         """Write what waits in memory and return when it is on the disk.
@@ -150,17 +154,22 @@ class CrashSafeWriter(MessageWriter):
         """Close the file behind its last complete record, with a summary where that still fits."""
         with contextlib.suppress(OSError):
             self._cut()
-            if not self._ended():
-                # without the messages that found no room, the summary may find some
+            if self._tried(self._mcap.finish):
+                return
+            # no room for all that waits: some of it, one by one, and the summary may still fit
+            self._cut()
+            while self._mcap.waiting and self._tried(lambda: self._mcap.flush(limit=1)):
+                pass
+            self._cut()
+            self._mcap.drop_waiting()
+            if not self._tried(self._mcap.finish):
                 self._cut()
-                self._mcap.drop_waiting()
-                if not self._ended():
-                    self._cut()
 
-    def _ended(self) -> bool:
+    def _tried(self, write: Callable[[], None]) -> bool:
+        """Whether something could be written."""
         try:
             with self._writing(ignore_failure=True):
-                self._mcap.finish()
+                write()
                 os.fsync(self._file.fileno())
         except TooltipError:
             return False

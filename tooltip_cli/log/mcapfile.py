@@ -114,13 +114,19 @@ class McapFile:
         if self._waiting_bytes >= CHUNK_BYTES:
             self.flush()
 
-    def flush(self) -> None:
-        """Write the messages that wait as a chunk of their own; nothing where none wait."""
-        if not self._waiting:
+    @property
+    def waiting(self) -> int:
+        """Messages that wait for :meth:`flush`."""
+        return len(self._waiting)
+
+    def flush(self, limit: int | None = None) -> None:
+        """Write the messages that wait, or the first of them, as a chunk of their own."""
+        messages = self._waiting[:limit]
+        if not messages:
             return
-        records, entries = self._chunk_records()
+        records, entries = self._chunk_records(messages)
         packed = self._compressor.compress(records)
-        times = [time for _, time, _, _ in self._waiting]
+        times = [time for _, time, _, _ in messages]
         head = _CHUNK.pack(
             Opcode.CHUNK,
             _CHUNK_FIELDS + len(packed),
@@ -140,7 +146,8 @@ class McapFile:
             MessageIndex(channel, pairs).write(builder)
         indexes = _taken(builder)
         self._append(head, packed, indexes)
-        self._waiting, self._waiting_bytes = [], 0
+        self._waiting = self._waiting[len(messages) :]
+        self._waiting_bytes = sum(len(head) + len(payload) for *_, head, payload in self._waiting)
         for channel, pairs in entries.items():
             self._counts[channel] = self._counts.get(channel, 0) + len(pairs)
         self._chunk_indexes.append(
@@ -161,13 +168,15 @@ class McapFile:
         """Give up the messages that wait, where no room is left for them."""
         self._waiting, self._waiting_bytes = [], 0
 
-    def _chunk_records(self) -> tuple[bytes, dict[int, list[tuple[int, int]]]]:
+    def _chunk_records(
+        self, messages: list[_Waiting]
+    ) -> tuple[bytes, dict[int, list[tuple[int, int]]]]:
         """Return the records of a chunk, and by channel each message's log time and offset."""
         parts: list[bytes] = []
         size = 0
         schemas: set[int] = {0}
         entries: dict[int, list[tuple[int, int]]] = {}
-        for channel, log_time_ns, head, payload in self._waiting:
+        for channel, log_time_ns, head, payload in messages:
             if channel not in entries:
                 schema, definition = self._channels[channel]
                 if schema not in schemas:

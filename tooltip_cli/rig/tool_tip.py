@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -14,7 +13,6 @@ from tooltip_cli.rig.tree import KinematicTree
 Array = npt.NDArray[np.float64]
 
 TIP_LINK = "tool_tip"
-_END = re.compile(r"</\s*robot\s*>\s*(?:<!--.*?-->\s*)*\Z", re.DOTALL)
 
 
 def urdf_with_tip(urdf: str, hand_frame: str, position: Array, source: str) -> str:
@@ -38,8 +36,8 @@ def urdf_with_tip(urdf: str, hand_frame: str, position: Array, source: str) -> s
         raise TooltipError(
             f"{source}: the robot already has a link '{TIP_LINK}'; give the URDF without it"
         )
-    end = _END.search(urdf)
-    if end is None:
+    end = urdf.rfind("</robot")
+    if end < 0:
         raise TooltipError(f"{source}: the URDF does not end with </robot>")
     xyz = " ".join(f"{value:.6f}" for value in position)
     addition = (
@@ -50,10 +48,13 @@ def urdf_with_tip(urdf: str, hand_frame: str, position: Array, source: str) -> s
         f'    <origin xyz="{xyz}" rpy="0 0 0"/>\n'
         "  </joint>\n"
     )
-    text = urdf[: end.start()] + addition + urdf[end.start() :]
+    text = urdf[:end] + addition + urdf[end:]
     check = KinematicTree.from_urdf(text, source)
-    place = next(i for i, link in enumerate(check.links) if link.name == TIP_LINK)
-    found = check.parent_from_link({})[place][:3, 3]
-    if check.links[place].parent != hand_frame or not np.allclose(found, position, atol=1e-6):
+    found = [
+        transform[:3, 3]
+        for link, transform in zip(check.links, check.parent_from_link({}), strict=True)
+        if (link.name, link.parent) == (TIP_LINK, hand_frame)
+    ]
+    if not (found and np.allclose(found[0], position, atol=1e-6)):  # it ends in a comment, say
         raise TooltipError(f"{source}: the tip cannot be added to this URDF; check its XML")
     return text
