@@ -26,7 +26,7 @@ from tests.helpers.robot import CAMERA, CAMERA_FRAME, HAND_FRAME, RIG, TIP, URDF
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.labels.files import match_labels, read_labels
 from tooltip_cli.log import messages
-from tooltip_cli.log.container import iterate
+from tooltip_cli.log.container import LoggedAttachment, iterate
 from tooltip_cli.log.detections import read_detections, write_detections
 from tooltip_cli.log.edges import read_edges, write_edges
 from tooltip_cli.log.images import decode_compressed, decode_raw
@@ -179,13 +179,13 @@ def _raw(path: Path) -> None:
 
 
 def _messages() -> list[Message]:
-    parts = wrist_parts(FRAMES)
-    return sorted(itertools.chain(*parts.values()), key=lambda message: message.log_time_ns)
+    return list(itertools.chain(*wrist_parts(FRAMES).values()))
 
 
-def _foreign(folder: Path, compression: CompressionType, *, chunked: bool) -> bytes:
+def _unchecked(log: bytes, folder: Path, compression: CompressionType, *, chunked: bool) -> bytes:
     """Return a log without any checksum, so that changes reach what lies behind them."""
-    path = folder / "foreign.mcap"
+    source, path = folder / "source.mcap", folder / "unchecked.mcap"
+    source.write_bytes(log)
     with path.open("wb") as file:
         writer = McapWriter(
             file,
@@ -196,16 +196,17 @@ def _foreign(folder: Path, compression: CompressionType, *, chunked: bool) -> by
         )
         writer.start("ros2", "fuzz")
         channels: dict[str, int] = {}
-        for message in _messages():
-            if message.topic not in channels:
-                text = schema_text(message.datatype).encode()
-                schema = writer.register_schema(message.datatype, "ros2msg", text)
-                channels[message.topic] = writer.register_channel(message.topic, "cdr", schema)
+        for item in iterate(source):
+            if isinstance(item, LoggedAttachment):
+                writer.add_attachment(0, 0, item.name, item.media_type, item.data)
+                continue
+            if item.topic not in channels:
+                text = schema_text(item.datatype).encode()
+                schema = writer.register_schema(item.datatype, "ros2msg", text)
+                channels[item.topic] = writer.register_channel(item.topic, "cdr", schema)
             writer.add_message(
-                channels[message.topic], message.log_time_ns, message.payload, message.log_time_ns
+                channels[item.topic], item.log_time_ns, item.payload, item.publish_time_ns
             )
-        for name, text_ in rig_files(RIG).items():
-            writer.add_attachment(0, 0, name, "text/plain", text_.encode())
         writer.finish()  # type: ignore[no-untyped-call]  # the library's own gap
     return path.read_bytes()
 
@@ -251,10 +252,14 @@ def targets(folder: Path) -> dict[str, Target]:
     ours = write_log(folder / "ours.mcap", _messages()).read_bytes()
     logs = (
         ours,
-        _foreign(folder, CompressionType.NONE, chunked=True),
-        _foreign(folder, CompressionType.NONE, chunked=False),
-        _foreign(folder, CompressionType.LZ4, chunked=True),
-        _foreign(folder, CompressionType.ZSTD, chunked=True),
+        _unchecked(ours, folder, CompressionType.NONE, chunked=True),
+        _unchecked(ours, folder, CompressionType.NONE, chunked=False),
+        _unchecked(ours, folder, CompressionType.LZ4, chunked=True),
+        _unchecked(ours, folder, CompressionType.ZSTD, chunked=True),
+    )
+    detections, edges = (
+        (log, _unchecked(log, folder, CompressionType.NONE, chunked=True))
+        for log in (_detections(folder), _edges(folder))
     )
     raw = messages.encode(
         messages.IMAGE,
@@ -283,10 +288,8 @@ def targets(folder: Path) -> dict[str, Target]:
         ),
         "info": Target(".mcap", logs, inspect),
         "bag import": Target(".mcap", logs, _import_bag),
-        "detections": Target(
-            ".mcap", (_detections(folder),), lambda path: read_detections(path, _STAMPS)
-        ),
-        "edges": Target(".mcap", (_edges(folder),), lambda path: read_edges(path, _STAMPS)),
+        "detections": Target(".mcap", detections, lambda path: read_detections(path, _STAMPS)),
+        "edges": Target(".mcap", edges, lambda path: read_edges(path, _STAMPS)),
         "compressed image": Target(".bin", (jpeg_of(0), encoded(image_of(1), ".png")), _compressed),
         "raw image": Target(".bin", (raw,), _raw),
         "rig file": Target(".yaml", (rig["rig.yaml"].encode(),), read_rig, text=True),

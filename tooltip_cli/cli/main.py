@@ -73,6 +73,8 @@ def main(verbose: bool) -> None:
     """
     # OpenCV would print its own lines about damaged images beside ours; read when it is imported
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    # and decode a gigapixel that a file of a kilobyte claims
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**25))
     logging.basicConfig(
         stream=sys.stderr,
         level=logging.INFO if verbose else logging.WARNING,

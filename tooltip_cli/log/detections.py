@@ -87,7 +87,7 @@ def read_detections(path: Path, stamps_ns: npt.NDArray[np.int64]) -> Detections:
         TooltipError: unreadable, or of another recording.
     """
     rows = [
-        messages.decode(messages.TIP_DETECTION, item.payload)
+        messages.decode_foreign(messages.TIP_DETECTION, item.payload, str(path))
         for item in iterate(path)
         if not isinstance(item, LoggedAttachment) and item.topic == TOPIC
     ]

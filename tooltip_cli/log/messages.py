@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 
+from tooltip_cli.errors import TooltipError
 from tooltip_cli.resources import resource
 from tooltip_cli.rig.camera import CameraModel
 
@@ -114,6 +115,21 @@ def decode(datatype: str, payload: bytes) -> Any:
         Exception: whatever the decoder meets in bytes that are not such a message.
     """
     return _decoder(datatype)(payload)
+
+
+def decode_foreign(datatype: str, payload: bytes, source: str) -> Any:
+    """Decode a message that somebody else may have written.
+
+    Raises:
+        TooltipError: it is none of that type; ``source`` says where it stands.
+    """
+    try:
+        return decode(datatype, payload)
+    except Exception as error:  # the decoder meets arbitrary bytes
+        raise TooltipError(
+            f"{source}: a message is not a {datatype} ({error!r}); record it again, or leave the "
+            "topic out"
+        ) from error
 
 
 def time_from_ns(stamp_ns: int) -> dict[str, int]:

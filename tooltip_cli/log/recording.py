@@ -112,7 +112,9 @@ class Recording:
         with self.path.open("rb") as file:
             for index in indices:
                 payload = _payload(file, self._places[index], cache, self.path)
-                yield _decode(self.image_type, payload, f"{self.path}: image {index}")
+                yield messages.decode_foreign(
+                    self.image_type, payload, f"{self.path}: image {index}"
+                )
 
 
 def _payload(
@@ -260,7 +262,9 @@ class _Index:
             return None
         cameras = []
         for payload in dict.fromkeys(map(_without_stamp, self._payloads[topic])):
-            message = _decode(messages.CAMERA_INFO, payload, f"{self.path}: {topic}")
+            message = messages.decode_foreign(
+                messages.CAMERA_INFO, payload, f"{self.path}: {topic}"
+            )
             cameras.append(messages.camera_from_info(message, f"{self.path}: {topic}"))
         if any(camera != cameras[0] for camera in cameras):
             raise TooltipError(
@@ -283,7 +287,9 @@ class _Index:
     def _joint_tracks(self, topic: str) -> dict[str, JointTrack]:
         samples: dict[str, tuple[list[int], list[float]]] = {}
         for payload in self._payloads[topic]:
-            message = _decode(messages.JOINT_STATE, payload, f"{self.path}: {topic}")
+            message = messages.decode_foreign(
+                messages.JOINT_STATE, payload, f"{self.path}: {topic}"
+            )
             stamp_ns = messages.ns_from_time(message.header.stamp)
             # positions may be left empty by a controller that reports only effort
             for name, position in zip(message.name, message.position, strict=False):
@@ -322,7 +328,9 @@ class _Index:
     def _pose_track(self, topic: str) -> PoseTrack:
         stamps, rows, frames, left_out = [], [], set(), 0
         for payload in self._payloads[topic]:
-            message = _decode(messages.POSE_STAMPED, payload, f"{self.path}: {topic}")
+            message = messages.decode_foreign(
+                messages.POSE_STAMPED, payload, f"{self.path}: {topic}"
+            )
             frames.add(str(message.header.frame_id))
             p, q = message.pose.position, message.pose.orientation
             row = np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
@@ -352,7 +360,9 @@ class _Index:
         texts = {}
         for topic in filter(lambda name: _is_description(name, self.types[name]), self.types):
             where = f"{self.path}: {topic}"
-            texts[topic] = str(_decode(messages.STRING, self._payloads[topic][-1], where).data)
+            texts[topic] = str(
+                messages.decode_foreign(messages.STRING, self._payloads[topic][-1], where).data
+            )
         if len(set(texts.values())) > 1:
             raise TooltipError(
                 f"{self.path} has several robot descriptions: {', '.join(sorted(texts))}; name the "
@@ -367,16 +377,6 @@ class _Index:
         if duplicates and not quiet:
             self.notes.append(f"{topic}: {duplicates} duplicate stamps; the first of each is kept")
         return order
-
-
-def _decode(datatype: str, payload: bytes, source: str) -> Any:
-    try:
-        return messages.decode(datatype, payload)
-    except Exception as error:  # the decoder meets arbitrary bytes
-        raise TooltipError(
-            f"{source}: a message is not a {datatype} ({error!r}); record it again, or leave the "
-            "topic out"
-        ) from error
 
 
 def _is_description(topic: str, datatype: str) -> bool:

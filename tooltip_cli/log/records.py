@@ -142,12 +142,21 @@ def _unpacked(chunk: ChunkHead) -> bytes:
         frame = lz4.frame.LZ4FrameDecompressor()
         return bytes(frame.decompress(chunk.data, max_length=chunk.size + 1))
     if chunk.compression == "zstd":
-        unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES)
-        if zstandard.frame_content_size(chunk.data) == chunk.size:
-            return bytes(unpacker.decompress(chunk.data))
-        with unpacker.stream_reader(chunk.data) as reader:
-            return bytes(reader.read(chunk.size + 1))
+        return unpack_zstd(chunk.data, chunk.size)
     return bytes(chunk.data)
+
+
+def unpack_zstd(data: memoryview | bytes, limit: int) -> bytes:
+    """Return what a zstd frame holds, or its first ``limit`` + 1 bytes where it is more.
+
+    Raises:
+        zstandard.ZstdError: it is no such frame.
+    """
+    unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES)
+    if 0 <= zstandard.frame_content_size(data) <= limit:
+        return bytes(unpacker.decompress(data))
+    with unpacker.stream_reader(data) as reader:
+        return bytes(reader.read(limit + 1))
 
 
 def _unpack_beginning(compression: str, data: memoryview) -> bytes:

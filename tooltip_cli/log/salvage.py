@@ -191,7 +191,7 @@ class _Target:
     def __init__(self, mcap: McapFile) -> None:
         self.mcap = mcap
         self.digests: dict[str, int] = {}  # CRC of all payloads, by topic
-        self._copier = Copier(mcap)
+        self._copier = Copier(mcap, plain_qos=False)
 
     def take(self, item: LoggedMessage | Attachment | Metadata) -> None:
         if isinstance(item, Attachment):

@@ -154,7 +154,8 @@ class _Walk:
             self._end(position)
             return None
         opcode, length = _frame(frame)
-        if opcode == Opcode.DATA_END and length == CRC.size:
+        ended = position + FRAME.size + CRC.size <= self._size
+        if opcode == Opcode.DATA_END and length == CRC.size and ended:
             self._check_end(position)
             return None
         if not _possible(opcode) or opcode in _IN_SUMMARY:

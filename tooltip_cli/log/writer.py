@@ -69,7 +69,7 @@ class MessageWriter:
 
     def _start(self, file: BinaryIO) -> None:
         self._mcap = McapFile(file, profile=Profile.ROS2, library=f"tooltip-cli/{__version__}")
-        self._copier = Copier(self._mcap)
+        self._copier = Copier(self._mcap, plain_qos=True)
 
     def _writing(self) -> AbstractContextManager[None]:
         """Surround everything that touches the file."""
