@@ -17,6 +17,7 @@ from tooltip_cli.errors import TooltipError
 from tooltip_cli.log import messages
 from tooltip_cli.log.container import LoggedAttachment, LoggedMessage, iterate, read_chunk
 from tooltip_cli.log.images import decode_compressed, decode_raw
+from tooltip_cli.log.messages import decode_foreign
 from tooltip_cli.log.sync import sorted_unique
 from tooltip_cli.log.topics import choose_info, choose_topic
 from tooltip_cli.rig.camera import CameraModel
@@ -112,9 +113,7 @@ class Recording:
         with self.path.open("rb") as file:
             for index in indices:
                 payload = _payload(file, self._places[index], cache, self.path)
-                yield messages.decode_foreign(
-                    self.image_type, payload, f"{self.path}: image {index}"
-                )
+                yield decode_foreign(self.image_type, payload, f"{self.path}: image {index}")
 
 
 def _payload(
@@ -262,9 +261,7 @@ class _Index:
             return None
         cameras = []
         for payload in dict.fromkeys(map(_without_stamp, self._payloads[topic])):
-            message = messages.decode_foreign(
-                messages.CAMERA_INFO, payload, f"{self.path}: {topic}"
-            )
+            message = decode_foreign(messages.CAMERA_INFO, payload, f"{self.path}: {topic}")
             cameras.append(messages.camera_from_info(message, f"{self.path}: {topic}"))
         if any(camera != cameras[0] for camera in cameras):
             raise TooltipError(
@@ -287,9 +284,7 @@ class _Index:
     def _joint_tracks(self, topic: str) -> dict[str, JointTrack]:
         samples: dict[str, tuple[list[int], list[float]]] = {}
         for payload in self._payloads[topic]:
-            message = messages.decode_foreign(
-                messages.JOINT_STATE, payload, f"{self.path}: {topic}"
-            )
+            message = decode_foreign(messages.JOINT_STATE, payload, f"{self.path}: {topic}")
             stamp_ns = messages.ns_from_time(message.header.stamp)
             # positions may be left empty by a controller that reports only effort
             for name, position in zip(message.name, message.position, strict=False):
@@ -328,9 +323,7 @@ class _Index:
     def _pose_track(self, topic: str) -> PoseTrack:
         stamps, rows, frames, left_out = [], [], set(), 0
         for payload in self._payloads[topic]:
-            message = messages.decode_foreign(
-                messages.POSE_STAMPED, payload, f"{self.path}: {topic}"
-            )
+            message = decode_foreign(messages.POSE_STAMPED, payload, f"{self.path}: {topic}")
             frames.add(str(message.header.frame_id))
             p, q = message.pose.position, message.pose.orientation
             row = np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
@@ -361,7 +354,7 @@ class _Index:
         for topic in filter(lambda name: _is_description(name, self.types[name]), self.types):
             where = f"{self.path}: {topic}"
             texts[topic] = str(
-                messages.decode_foreign(messages.STRING, self._payloads[topic][-1], where).data
+                decode_foreign(messages.STRING, self._payloads[topic][-1], where).data
             )
         if len(set(texts.values())) > 1:
             raise TooltipError(
