@@ -51,14 +51,21 @@ def chunk_ends(path: Path) -> list[tuple[int, int]]:
     ]
 
 
-def repacked(path: Path, out: Path, compression: CompressionType, *, chunked: bool = True) -> Path:
+def repacked(
+    path: Path,
+    out: Path,
+    compression: CompressionType,
+    *,
+    chunked: bool = True,
+    chunk_bytes: int = 200_000,
+) -> Path:
     """Write the messages of a log again with the library's own writer."""
     with out.open("wb") as file:
         writer = McapWriter(
             file,
             compression=compression,
             use_chunking=chunked,
-            chunk_size=200_000,
+            chunk_size=chunk_bytes,
             enable_data_crcs=True,
         )
         writer.start("ros2", "test")

@@ -17,15 +17,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    ChunkIndex,
-    Footer,
-    Header,
-    MessageIndex,
-    Metadata,
-    Statistics,
-)
+from mcap.records import Header, MessageIndex, Metadata, Statistics
 
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.log.container import open_log
@@ -43,8 +35,8 @@ from tooltip_cli.log.records import (
     read_attachment,
     unpack,
 )
+from tooltip_cli.log.summary import is_closed, read_summary
 
-_FOOTER_BYTES = FRAME.size + 20
 _CHUNK_HEAD = re.compile(
     rb"\x06.{5}\0{3}.{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd).{4}\0{4}", re.DOTALL
 )
@@ -52,6 +44,7 @@ _FRAME_HEAD = re.compile(rb"[\x01-\x0f].{5}\0{3}", re.DOTALL)
 _HEAD_BYTES = 64  # longest match, and more
 _CHAIN = 4  # records in a row that are no accident
 _BLOCK_BYTES = 1 << 22
+_CHUNK_OPCODE = bytes([Opcode.CHUNK])
 _LAST_OPCODE = 0x0F
 _IN_SUMMARY = (
     Opcode.FOOTER,
@@ -140,11 +133,24 @@ class _Walk:
                 open_log(found.path).close()  # says what the file is instead
             found.notes.append("the first bytes of the file are damaged")
             found.damaged, self._crc = True, None
-        self._read_summary()
+        self._take_summary()
         position: int | None = len(MAGIC)
         while position is not None:
             position = self._step(position)
         return found
+
+    def _take_summary(self) -> None:
+        """Take definitions, places and counts from the summary, if there is one that is intact."""
+        found = self._found
+        try:
+            summary = read_summary(self._file, self._size)
+        except RecordError as error:
+            found.notes.append(str(error))
+            found.damaged = True
+            return
+        if summary is not None:
+            self._places = summary.places
+            found.definitions, found.statistics = summary.definitions, summary.statistics
 
     def _step(self, position: int) -> int | None:
         """Take the record at a position; return where the next one is, None at the end."""
@@ -183,20 +189,21 @@ class _Walk:
 
     def _chunk_length(self, position: int, length: int) -> int:
         """Return a chunk's length; by its own fields where the frame's leads nowhere."""
-        after = position + FRAME.size + length
-        if after <= self._size and self._plausible(after):
+        if self._plausible(position + FRAME.size + length, strictly=True):
             return length
-        head = self._read(position + FRAME.size, _HEAD_BYTES)
-        try:
-            inner = chunk_length(head)
-        except RecordError:
-            return length
-        after = position + FRAME.size + inner
-        if inner == length or after > self._size or not self._plausible(after):
+        inner = self._inner_length(position)
+        if inner is None or not self._plausible(position + FRAME.size + inner, strictly=True):
             return length
         self._found.damaged, self._crc = True, None
         self._found.notes.append(f"the chunk at byte {position} claims a wrong length")
         return inner
+
+    def _inner_length(self, position: int) -> int | None:
+        """Return a chunk's length by its own fields; None where these are none of a chunk."""
+        try:
+            return chunk_length(self._read(position + FRAME.size, _HEAD_BYTES))
+        except RecordError:
+            return None
 
     def _check(self, opcode: int, data: bytes) -> bool:
         """Return whether a record's own checksum holds; False: it has none.
@@ -240,7 +247,9 @@ class _Walk:
             found.parts.append(Gap(position, after - position, reason, lost))
             found.damaged = True
             return after
-        following = self._next_intact(position + 1)
+        # what stands in a chunk that the file's end cuts off does not stand alone
+        chunk = self._read(position, 1) == _CHUNK_OPCODE and self._inner_length(position)
+        following = self._next_intact(position + 1, lone=not chunk)
         if following is None:
             self._end(position, reason)
             return None
@@ -255,7 +264,7 @@ class _Walk:
         if stored and self._crc is not None and stored != self._crc:
             found.notes.append("the data section fails its CRC")
             found.damaged = True
-        if not self._closed:
+        if not is_closed(self._file, self._size):
             found.notes.append("the file does not end as it should; all data stand before that")
             found.truncated = True
 
@@ -266,7 +275,7 @@ class _Walk:
         frame = self._read(position, FRAME.size)
         opcode, length = _frame(frame) if len(frame) == FRAME.size else (0, 0)
         cut = position + FRAME.size + length > self._size or rest < FRAME.size
-        if self._closed or not (cut or self._zeros(position)):
+        if is_closed(self._file, self._size) or not (cut or self._zeros(position)):
             found.parts.append(Gap(position, rest, reason or "the end of the file is damaged"))
             found.damaged = True
             return
@@ -284,11 +293,19 @@ class _Walk:
         """Whether the file ends in zeros: a power cut leaves room that was never written."""
         return not any(self._read(max(position, self._size - 512), 512))
 
-    def _plausible(self, position: int) -> bool:
-        """Whether a record can start here, even one that the file's end cuts off."""
-        if position >= self._size:
-            return position == self._size
-        return _possible(self._read(position, 1)[0])
+    def _plausible(self, position: int, *, strictly: bool = False) -> bool:
+        """Whether a record can start here, even one that the file's end cuts off.
+
+        Args:
+            strictly: whether a length that no record has speaks against it.
+        """
+        frame = self._read(position, FRAME.size)
+        if len(frame) < FRAME.size:
+            return position <= self._size and (not frame or _possible(frame[0]))
+        opcode, length = _frame(frame)
+        if position + FRAME.size + length <= self._size:
+            return _possible(opcode)
+        return 0 < opcode <= _LAST_OPCODE and (length <= MAX_RECORD_BYTES or not strictly)
 
     def _indexed(self, position: int) -> dict[int, int] | None:
         """Count the messages that the indexes behind a damaged chunk list, by channel."""
@@ -309,8 +326,12 @@ class _Walk:
             position += FRAME.size + length
         return counts or None
 
-    def _next_intact(self, position: int) -> int | None:
-        """Return where the next intact chunk or attachment starts; None: nowhere."""
+    def _next_intact(self, position: int, *, lone: bool = False) -> int | None:
+        """Return where the next intact chunk or attachment starts; None: nowhere.
+
+        Args:
+            lone: look for messages outside chunks, too, where there are no chunks.
+        """
         if self._places:
             candidates: Iterator[int] = iter([place for place in self._places if place >= position])
         else:
@@ -329,11 +350,11 @@ class _Walk:
                     return place
             except RecordError:
                 continue
-        if self._places or any(
+        chunked = any(
             isinstance(part, Part) and part.opcode == Opcode.CHUNK for part in self._found.parts
-        ):
+        )
+        if self._places or chunked or not lone:
             return None
-        # messages that stand alone, outside chunks
         return next(filter(self._chain, self._matches(_FRAME_HEAD, position)), None)
 
     def _chain(self, position: int) -> bool:
@@ -360,54 +381,9 @@ class _Walk:
                 start = match.start() + 1
             position += _BLOCK_BYTES
 
-    @property
-    def _closed(self) -> bool:
-        """Whether footer and closing bytes are where they belong."""
-        tail_bytes = _FOOTER_BYTES + len(MAGIC)
-        tail = self._read(max(self._size - tail_bytes, 0), tail_bytes)
-        return tail[_FOOTER_BYTES:] == MAGIC and FRAME.unpack_from(tail) == (Opcode.FOOTER, 20)
-
-    def _read_summary(self) -> None:
-        """Take definitions, places and counts from the summary, if there is one that is intact."""
-        if not self._closed:
-            return
-        tail_start = self._size - len(MAGIC) - _FOOTER_BYTES
-        tail = self._read(tail_start, _FOOTER_BYTES)
-        footer = parsed(Footer, tail[FRAME.size :])
-        length = tail_start - footer.summary_start
-        if not footer.summary_start or not 0 <= length <= MAX_RECORD_BYTES:
-            return
-        summary = self._read(footer.summary_start, length)
-        actual = zlib.crc32(tail[: -CRC.size], zlib.crc32(summary))
-        if footer.summary_crc not in (0, actual):
-            self._found.notes.append("the summary fails its CRC")
-            self._found.damaged = True
-            return
-        if not footer.summary_crc:
-            return  # nothing says that it is intact, and nothing needs it
-        position = 0
-        while position + FRAME.size <= length:
-            opcode, size = FRAME.unpack_from(summary, position)
-            position += FRAME.size
-            self._take_summary(opcode, summary[position : position + size])
-            position += size
-        self._places.sort()
-
-    def _take_summary(self, opcode: int, data: bytes) -> None:
-        try:
-            if opcode == Opcode.CHUNK_INDEX:
-                self._places.append(parsed(ChunkIndex, data).chunk_start_offset)
-            elif opcode == Opcode.ATTACHMENT_INDEX:
-                self._places.append(parsed(AttachmentIndex, data).offset)
-            elif opcode == Opcode.STATISTICS:
-                self._found.statistics = parsed(Statistics, data)
-            else:
-                self._found.definitions.take(opcode, data)
-        except RecordError as error:
-            self._found.notes.append(f"the summary is not readable ({error})")
-            self._found.damaged = True
-
     def _read(self, offset: int, length: int) -> bytes:
+        if offset >= self._size:  # wherever a length has led
+            return b""
         self._file.seek(offset)
         return self._file.read(length)
 
