@@ -132,6 +132,7 @@ def recovered(
             if isinstance(part, Gap):
                 tally.gap(part, definitions)
                 continue
+            taken = 0
             trusted = part.verified or unverified or not found.damaged
             file.seek(part.offset + FRAME.size)
             data = file.read(part.length)
@@ -140,6 +141,7 @@ def recovered(
                     for message in _messages(part, data, definitions, trusted):
                         if trusted:
                             tally.message(message)
+                            taken += 1
                             yield message
                         else:
                             tally.left_out(message)
@@ -154,8 +156,8 @@ def recovered(
                     tally.gap(Gap(part.offset, part.length, str(error)), definitions)
             if part.partial:
                 reason = "the file ends inside a chunk"
-                if trusted:
-                    reason += ", of which the whole messages were recovered"
+                if taken:
+                    reason += f", of which {taken} whole messages were recovered"
                 tally.gap(Gap(part.offset, part.length, reason), definitions)
 
 

@@ -57,8 +57,8 @@ class KinematicTree:
             frames.append((connection.parentFrame, index))
         names = tuple(
             name
-            for name, model_joint in zip(model.names, model.joints, strict=True)
-            if model_joint.nv == 1
+            for index, name in enumerate(model.names)
+            if index and model.joints[index].nv == 1  # the first stands for the world
         )
         return cls(root, tuple(links), names, model, tuple(frames))
 
