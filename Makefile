@@ -6,7 +6,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: install demo test lint types docs clean
+NODE_STAMP := tests/interop/node_modules/.installed
+
+.PHONY: install demo test interop interop-rerun lint types docs clean
 
 install: $(STAMP)
 
@@ -21,7 +23,23 @@ demo: install
 	$(BIN)/tooltip demo $(DEMO) --tools $(TOOLS) --jobs 2
 
 test: install
+	-@$(MAKE) --no-print-directory interop
 	$(BIN)/python -m pytest -n 2
+
+# An independent MCAP reader for the tests of our files; they skip without it.
+interop:
+	@if command -v npm >/dev/null; then $(MAKE) --no-print-directory $(NODE_STAMP); \
+	else echo "npm is not installed: the tests with the node reader are skipped"; fi
+
+$(NODE_STAMP): tests/interop/package.json
+	npm install --prefix tests/interop --no-package-lock --no-audit --no-fund --silent
+	touch $@
+
+# Large (800 MB), so it is no part of the tests.
+interop-rerun: install
+	test -d .venv-rerun || $(PYTHON) -m venv .venv-rerun
+	.venv-rerun/bin/python -m pip install --quiet "rerun-sdk>=0.30,<1"
+	$(BIN)/python -m tests.interop.rerun_check .venv-rerun/bin/rerun
 
 lint: install
 	$(BIN)/ruff check .
@@ -35,4 +53,4 @@ docs: install
 	$(BIN)/python docs/make_parameter_tables.py
 
 clean:
-	rm -rf $(VENV) demo .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-rerun tests/interop/node_modules demo .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -161,4 +161,4 @@ def test_a_message_of_another_kind_is_refused(tmp_path: Path) -> None:
     with LogWriter(path) as writer:
         payload = messages.string("not edges")
         writer.write(Message(TOPIC, messages.STRING, int(STAMPS[0]), payload))
-    assert "moving edges" in refused(path)
+    assert "MovingEdges" in refused(path)

@@ -482,7 +482,9 @@ def giant_png() -> bytes:
 )
 def test_images_that_are_no_images(data: bytes, tmp_path: Path) -> None:
     recording = read(tmp_path, [image_message(1, jpeg_of(0)), image_message(2, data)])
-    with pytest.raises(TooltipError, match=r"a\.mcap: image 1 \(jpeg\) cannot be decoded"):
+    with pytest.raises(
+        TooltipError, match=r"a\.mcap: image 1 (\(jpeg\) cannot be decoded|claims 60000x60000)"
+    ):
         list(recording.images([0, 1]))
 
 

@@ -31,6 +31,14 @@ class DamagedLogError(TooltipError):
     """An MCAP file that is truncated or fails a checksum; nothing damaged was read."""
 
 
+class LowDiskError(TooltipError):
+    """Recording stopped before the disk was full; everything before is written."""
+
+
+class StoppedError(TooltipError):
+    """Work ended early because somebody asked for it; what was done so far is kept."""
+
+
 class RefusedError(TooltipError):
     """No trustworthy answer exists in this data; the message says why (exit code 3)."""
 

@@ -11,17 +11,21 @@ from typing import Any
 import click
 
 from tooltip_cli import __version__
+from tooltip_cli.cli.options import printable
 from tooltip_cli.errors import TooltipError
 
 # Name -> one line for `tooltip --help`. Each command lives in the module of its name and is
 # imported only when it is asked for, so that `--help` answers at once.
 COMMANDS = {
     "record": "Record or import images and joint angles into an MCAP log.",
+    "info": "Say what a recording holds, and what is wrong with it.",
+    "salvage": "Recover what is intact of a damaged recording.",
     "detect": "Find the tip's pixel in each frame by motion.",
     "estimate": "Find the 3D tip in the hand frame.",
     "evaluate": "Measure the estimate against hand labels and write a report.",
     "calibrate": "Find clock offset and camera pose from recordings of one robot.",
     "compare": "Compare reports, frame by frame.",
+    "export": "Write the result for viewers and robots.",
     "demo": "Simulate recordings and take them through every stage.",
 }
 
@@ -51,13 +55,8 @@ class LazyGroup(click.Group):
         try:
             return super().invoke(ctx)
         except TooltipError as error:
-            click.echo(f"Error: {_printable(str(error))}", err=True)
+            click.echo(f"Error: {printable(str(error))}", err=True)
             ctx.exit(error.exit_code)
-
-
-def _printable(text: str) -> str:
-    """Return text on one line; names out of a log may hold line breaks and terminal codes."""
-    return "".join(char if char.isprintable() else " " for char in text)
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
@@ -77,6 +76,8 @@ def main(verbose: bool) -> None:
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     # small products only: threads of the linear algebra would spin, and round differently
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # and decode a gigapixel that a file of a kilobyte claims
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**25))
     logging.basicConfig(
         stream=sys.stderr,
         level=logging.INFO if verbose else logging.WARNING,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import math
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -21,6 +23,16 @@ PATH = click.Path(path_type=Path)
 METHODS = ("voting", "kmeans", "map")
 _PATIENCE_S = 1.0
 _RESULTS = (".detections.mcap", ".edges.mcap")
+
+
+def size_in_bytes(text: str) -> int:
+    """Return the bytes of a size such as 500MB, 1GB (powers of 1000) or 1GiB (of 1024)."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?", text.strip().lower())
+    if match is None:
+        raise click.BadParameter(f"'{text}' is no size; give one such as 500MB or 1GB")
+    number, prefix, binary = match.groups()
+    power = " kmgt".index(prefix or " ")
+    return int(float(number) * (1024 if binary else 1000) ** power)
 
 
 def recordings_argument(command: _Command) -> _Command:
@@ -113,6 +125,35 @@ def topic_options(command: _Command) -> _Command:
             f"--{name}", metavar="TOPIC", help=f"Topic of the {what}, where there are several."
         )(command)
     return command
+
+
+def plural(count: int, noun: str) -> str:
+    """Return "1 image", "2 images"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def utc(stamp_ns: int) -> str:
+    """Return a time as people read it, to the millisecond."""
+    time = datetime.datetime.fromtimestamp(stamp_ns // 10**9, datetime.timezone.utc)
+    return f"{time:%Y-%m-%dT%H:%M:%S}.{stamp_ns // 10**6 % 1000:03}Z"
+
+
+def printable(text: str) -> str:
+    """Return text on one line; names out of a log may hold line breaks and terminal codes."""
+    return "".join(char if char.isprintable() else " " for char in text)
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> list[str]:
+    """Return the lines of a table; the first ``left`` columns begin at the left."""
+    cells = [[printable(cell) for cell in row] for row in (heads, *rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if column < left else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in cells
+    ]
 
 
 def say(message: str) -> None:

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from tooltip_cli.cli.options import PATH, jobs_option, print_json, progress, say, topic_options
+from tooltip_cli.cli.options import (
+    PATH,
+    jobs_option,
+    print_json,
+    progress,
+    say,
+    size_in_bytes,
+    topic_options,
+)
 
 if TYPE_CHECKING:
     from tooltip_cli.rig.rigfile import Rig
@@ -25,6 +33,14 @@ def _result_options(command: _Command) -> _Command:
     command = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")(
         command
     )
+    command = click.option(
+        "--min-free",
+        type=size_in_bytes,
+        default="100MB",
+        show_default=True,
+        metavar="SIZE",
+        help="Stop before the disk has less than this left.",
+    )(command)
     return click.option("--force", is_flag=True, help="Replace OUT.mcap if it exists.")(command)
 
 
@@ -49,6 +65,9 @@ def record() -> None:
 
     The log keeps the streams as they came. With --rig it also keeps the rig, the camera file and
     the robot description, so that later commands need nothing but the log.
+
+    Until it is finished the log is called OUT.mcap.unfinished and is on the disk up to the last
+    half second; what Ctrl-C, a crash or a full disk leaves of it, 'tooltip salvage' recovers.
 
     \b
     Examples:
@@ -114,6 +133,7 @@ def sim(
     motion: str,
     background: str,
     jobs: int,
+    min_free: int,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -128,6 +148,7 @@ def sim(
       tooltip record sim pliers.mcap --tool pliers
       tooltip record sim pen.mcap --tool pen --frames 200 --seed 7 --size 320x240
     """
+    from tooltip_cli.log.stopping import stop_on_signals
     from tooltip_cli.sources.sim import SimParams
     from tooltip_cli.stages.simulate import record_simulation
 
@@ -143,8 +164,16 @@ def sim(
         motion=motion,
         background=background,
     )
-    with progress(frames, f"record {out.name}") as advance:
-        done = record_simulation(params, out, jobs=jobs, overwrite=force, on_image=advance)
+    with progress(frames, f"record {out.name}") as advance, stop_on_signals() as stop:
+        done = record_simulation(
+            params,
+            out,
+            jobs=jobs,
+            overwrite=force,
+            min_free_bytes=min_free,
+            stop=stop,
+            on_image=advance,
+        )
     document = _tell(out, done.report)
     say(f"{done.labels}: simulated labels of the test frames")
     _finish({**document, "labels": str(done.labels)}, as_json)
@@ -165,6 +194,7 @@ def bag_(
     pose: str | None,
     rig: Path | None,
     robot: Path | None,
+    min_free: int,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -184,7 +214,7 @@ def bag_(
 
     topics = Topics(image=image, joints=joints, info=info, pose=pose)
     source = BagSource(bag, topics, _load_rig(rig), _load_urdf(robot))
-    _finish(_record(source, out, force), as_json)
+    _finish(_record(source, out, force, min_free), as_json)
 
 
 @record.command("lerobot", short_help="Import one episode of a LeRobot data set.")
@@ -209,6 +239,7 @@ def lerobot(
     state: str,
     rig: Path | None,
     robot: Path | None,
+    min_free: int,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -225,7 +256,7 @@ def lerobot(
     from tooltip_cli.sources.lerobot import LeRobotSource
 
     source = LeRobotSource(dataset, episode, camera, state, _load_rig(rig), _load_urdf(robot))
-    _finish(_record(source, out, force), as_json)
+    _finish(_record(source, out, force, min_free), as_json)
 
 
 @record.command("video", short_help="Import a video or a folder of images.")
@@ -260,6 +291,7 @@ def video_(
     start: str | None,
     rig: Path | None,
     robot: Path | None,
+    min_free: int,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -290,7 +322,7 @@ def video_(
         rig=_load_rig(rig),
         urdf=_load_urdf(robot),
     )
-    _finish(_record(source, out, force), as_json)
+    _finish(_record(source, out, force, min_free), as_json)
 
 
 def _load_rig(path: Path | None) -> Rig | None:
@@ -312,12 +344,15 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _record(source: Source, out: Path, force: bool) -> dict[str, Any]:
+def _record(source: Source, out: Path, force: bool, min_free: int) -> dict[str, Any]:
     """Write the log, say what was read and left out, and return the result."""
+    from tooltip_cli.log.stopping import stop_on_signals
     from tooltip_cli.stages.record import record as write
 
-    with progress(source.frames, f"record {out.name}") as advance:
-        report = write(source, out, overwrite=force, on_image=advance).report
+    with progress(source.frames, f"record {out.name}") as advance, stop_on_signals() as stop:
+        report = write(
+            source, out, overwrite=force, min_free_bytes=min_free, stop=stop, on_image=advance
+        ).report
     document = _tell(out, report)
     described = any(topic.endswith("robot_description") for topic in report.read)
     if source.rig is not None and source.rig.pose_topic is None and not described:

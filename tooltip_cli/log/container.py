@@ -1,50 +1,72 @@
 """The MCAP container read record by record, every checksum verified.
 
 The library's readers verify no checksum unless told to and report a truncated file as a record of
-impossible length. Here each record's declared length is compared with what is left of the file
-before anything is read, and whatever is wrong is said as what it is.
+impossible length. Here each record's declared length is compared with what is left of the file, and
+with what a record may sensibly be, before anything is read; what is wrong is said as what it is.
 
 Source: MCAP specification, sections "File Structure" and "Records".
 """
 
 from __future__ import annotations
 
+import logging
 import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Footer, Schema
-from mcap.stream_reader import get_chunk_data_stream
 
 from tooltip_cli.errors import DamagedLogError, TooltipError
+from tooltip_cli.log.mcapfile import MAGIC
+from tooltip_cli.log.records import (
+    CRC,
+    FRAME,
+    MAX_CHUNK_BYTES,
+    MAX_RECORD_BYTES,
+    MESSAGE,
+    Definitions,
+    LoggedChannel,
+    RecordError,
+    chunk_head,
+    inner_records,
+    read_attachment,
+    unpack,
+)
 
-MAGIC = b"\x89MCAP0\r\n"
-MAX_CHUNK_BYTES = 1 << 30
-_COMPRESSIONS = ("", "lz4", "zstd")
-_FRAME = struct.Struct("<BQ")  # opcode and length before every record
-_CRC = struct.Struct("<I")
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_FOOTER = struct.Struct("<QQI")  # where summary and its offsets start, CRC
+_BLOCK_BYTES = 1 << 20
+_LOG = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class LoggedMessage:
     """One message of a log, in file order."""
 
-    topic: str
-    datatype: str
-    encoding: str  # message encoding, "cdr" for ROS 2
+    channel: LoggedChannel
+    sequence: int
     log_time_ns: int
     publish_time_ns: int
     payload: bytes
     chunk_offset: int  # where its chunk starts in the file; -1 when it stands alone
     offset: int  # of the payload, in the decompressed chunk or in the file
+
+    @property
+    def topic(self) -> str:
+        """The channel's topic."""
+        return self.channel.topic
+
+    @property
+    def datatype(self) -> str:
+        """The schema's name; empty where there is none."""
+        return self.channel.schema.name if self.channel.schema is not None else ""
+
+    @property
+    def encoding(self) -> str:
+        """The message encoding, "cdr" for ROS 2."""
+        return self.channel.encoding
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,46 +85,90 @@ def read_chunk(file: BinaryIO, offset: int, path: Path) -> bytes:
         DamagedLogError: the chunk is damaged.
     """
     file.seek(offset)
-    _, length = _FRAME.unpack(file.read(_FRAME.size))
-    return _decompress(file.read(length), path, offset)
+    frame = file.read(FRAME.size)
+    opcode, length = FRAME.unpack(frame) if len(frame) == FRAME.size else (0, 0)
+    if opcode != Opcode.CHUNK or length > MAX_CHUNK_BYTES + FRAME.size:
+        raise _damaged(path, offset, "a chunk is not where it was")
+    try:
+        return unpack(chunk_head(memoryview(file.read(length))))
+    except RecordError as error:
+        raise _damaged(path, offset, str(error)) from error
 
 
 def iterate(path: Path) -> Iterator[LoggedMessage | LoggedAttachment]:
     """Yield messages and attachments in file order.
 
-    Memory: one chunk at a time.
+    Memory: one chunk at a time. Attachments too large for any use here are passed over.
 
     Raises:
         TooltipError: the file is missing, empty, unreadable, or not MCAP.
         DamagedLogError: it is truncated or a checksum fails; what was yielded before is intact.
     """
     with open_log(path) as file:
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
+        definitions = Definitions()
         for opcode, offset, data in _records(file, path):
             try:
                 if opcode == Opcode.CHUNK:
-                    chunk = _decompress(data, path, offset)
-                    for inner, start, length in _frames(chunk, path, offset):
-                        body = memoryview(chunk)[start : start + length]
-                        yield from _take(inner, body, schemas, channels, (offset, start), path)
+                    records = unpack(chunk_head(memoryview(data)))
+                    yield from chunk_messages(records, offset, definitions)
                 elif opcode == Opcode.ATTACHMENT:
-                    (stored,) = _CRC.unpack(data[-_CRC.size :])
-                    if stored and zlib.crc32(data[: -_CRC.size]) != stored:
-                        raise _damaged(path, offset, "an attachment fails its CRC")
-                    attachment = Attachment.read(_stream(data))
+                    attachment = read_attachment(data)
                     yield LoggedAttachment(attachment.name, attachment.media_type, attachment.data)
+                elif opcode == Opcode.MESSAGE:
+                    yield lone_message(data, offset, definitions)
                 else:
-                    yield from _take(
-                        opcode,
-                        memoryview(data),
-                        schemas,
-                        channels,
-                        (-1, offset + _FRAME.size),
-                        path,
-                    )
-            except (McapError, struct.error, ValueError, IndexError) as error:
-                raise _damaged(path, offset, f"a record cannot be read ({error!r})") from error
+                    definitions.take(opcode, data)
+            except RecordError as error:
+                raise _damaged(path, offset, str(error)) from error
+
+
+def chunk_messages(
+    records: bytes, offset: int, definitions: Definitions
+) -> Iterator[LoggedMessage]:
+    """Yield the messages of a chunk, taking its definitions.
+
+    Args:
+        records: the chunk, unpacked.
+        offset: where it starts in the file.
+
+    Raises:
+        RecordError: it holds something else than whole records; earlier messages were whole.
+    """
+    for opcode, start, length in inner_records(records):
+        if opcode == Opcode.MESSAGE:
+            yield _message(records, start, length, definitions, (offset, start))
+        else:
+            definitions.take(opcode, records[start : start + length])
+
+
+def lone_message(data: bytes, offset: int, definitions: Definitions) -> LoggedMessage:
+    """Return a message that stands outside chunks.
+
+    Args:
+        data: the content of its record, which starts at ``offset`` in the file.
+
+    Raises:
+        RecordError: it is none, or its channel is not defined.
+    """
+    return _message(data, 0, len(data), definitions, (-1, offset + FRAME.size))
+
+
+def _message(
+    data: bytes, start: int, length: int, definitions: Definitions, place: tuple[int, int]
+) -> LoggedMessage:
+    """Return a message; ``place``: its chunk, and where its record's content starts."""
+    if length < MESSAGE.size:
+        raise RecordError(f"a record cannot be read (a message of {length} bytes)")
+    number, sequence, log_time_ns, publish_time_ns = MESSAGE.unpack_from(data, start)
+    return LoggedMessage(
+        definitions.channel(number),
+        sequence,
+        log_time_ns,
+        publish_time_ns,
+        data[start + MESSAGE.size : start + length],
+        place[0],
+        place[1] + MESSAGE.size,
+    )
 
 
 def open_log(path: Path) -> BinaryIO:
@@ -118,9 +184,9 @@ def open_log(path: Path) -> BinaryIO:
                 "'tooltip record bag'"
             )
         file = path.open("rb")
+        magic = file.read(len(MAGIC))
     except OSError as error:
         raise TooltipError(f"{path}: cannot be opened ({error.strerror})") from error
-    magic = file.read(len(MAGIC))
     if magic == MAGIC:
         return file
     file.close()
@@ -139,112 +205,75 @@ def _records(file: BinaryIO, path: Path) -> Iterator[tuple[int, int, bytes]]:
     size = path.stat().st_size
     offset, checksum = len(MAGIC), zlib.crc32(MAGIC)
     while True:
-        frame = file.read(_FRAME.size)
-        if len(frame) < _FRAME.size:
+        frame = file.read(FRAME.size)
+        if len(frame) < FRAME.size:
             raise _truncated(path, offset)
-        opcode, length = _FRAME.unpack(frame)
-        if length > size - offset - _FRAME.size:
+        opcode, length = FRAME.unpack(frame)
+        if opcode == Opcode.FOOTER:
+            raise _damaged(path, offset, "the end of the data section is missing")
+        if length > size - offset - FRAME.size:
             raise _truncated(path, offset)
+        if length > MAX_RECORD_BYTES:
+            if opcode != Opcode.ATTACHMENT:
+                raise _damaged(path, offset, f"a record claims {length} bytes")
+            checksum = _pass_attachment(file, path, offset, length, zlib.crc32(frame, checksum))
+            offset += FRAME.size + length
+            continue
         data = file.read(length)
         if opcode == Opcode.DATA_END:
-            if length != _CRC.size:
+            if length != CRC.size:
                 raise _damaged(path, offset, "the end of the data section has the wrong length")
-            (stored,) = _CRC.unpack(data)
+            (stored,) = CRC.unpack(data)
             if stored and stored != checksum:
                 raise _damaged(path, offset, "the data section fails its CRC")
             break
         checksum = zlib.crc32(data, zlib.crc32(frame, checksum))
         yield opcode, offset, data
-        offset += _FRAME.size + length
-    _check_summary(file, path)
+        offset += FRAME.size + length
+    _check_summary(file, path, size)
 
 
-def _check_summary(file: BinaryIO, path: Path) -> None:
+def _pass_attachment(file: BinaryIO, path: Path, offset: int, length: int, checksum: int) -> int:
+    """Verify an attachment without keeping it; return the checksum of the data section so far."""
+    own = 0
+    left = length - CRC.size
+    while left:
+        block = file.read(min(left, _BLOCK_BYTES))
+        if not block:
+            raise _truncated(path, offset)
+        own, checksum = zlib.crc32(block, own), zlib.crc32(block, checksum)
+        left -= len(block)
+    stored = file.read(CRC.size)
+    if stored not in (CRC.pack(own), CRC.pack(0)):
+        raise _damaged(path, offset, "an attachment fails its CRC")
+    _LOG.warning("%s: an attachment of %d bytes is not read", path, length)
+    return zlib.crc32(stored, checksum)
+
+
+def _check_summary(file: BinaryIO, path: Path, size: int) -> None:
     """Verify what follows the data section: the summary's CRC and the closing magic bytes."""
     start = file.tell()
-    tail = file.read()
-    footer_size = _FRAME.size + 20
-    if len(tail) < footer_size + len(MAGIC) or tail[-len(MAGIC) :] != MAGIC:
+    footer_size = FRAME.size + _FOOTER.size
+    left = size - start - footer_size - len(MAGIC)
+    if left < 0:
         raise _truncated(path, start)
-    summary, footer_record = tail[: -footer_size - len(MAGIC)], tail[-footer_size - len(MAGIC) :]
-    if footer_record[0] != Opcode.FOOTER:
+    checksum = 0
+    while left:
+        block = file.read(min(left, _BLOCK_BYTES))
+        if not block:
+            raise _truncated(path, start)
+        checksum = zlib.crc32(block, checksum)
+        left -= len(block)
+    record, magic = file.read(footer_size), file.read(len(MAGIC))
+    if magic != MAGIC:
+        raise _truncated(path, start)
+    opcode, length = FRAME.unpack_from(record)
+    if opcode != Opcode.FOOTER or length != _FOOTER.size:
         raise _damaged(path, start, "the footer is not where it belongs")
-    footer = Footer.read(_stream(footer_record[_FRAME.size : footer_size]))
-    if footer.summary_crc:
-        # the footer's own bytes up to the checksum belong to what is summed
-        actual = zlib.crc32(footer_record[: footer_size - 4], zlib.crc32(summary))
-        if actual != footer.summary_crc:
-            raise _damaged(path, start, "the summary fails its CRC")
-
-
-def _decompress(data: bytes, path: Path, offset: int) -> bytes:
-    try:
-        chunk = Chunk.read(_stream(data))
-        if max(chunk.uncompressed_size, len(chunk.data)) > MAX_CHUNK_BYTES:
-            raise _damaged(
-                path, offset, f"a chunk claims {chunk.uncompressed_size} bytes, more than 1 GiB"
-            )
-        if chunk.compression not in _COMPRESSIONS:  # the library would take it as it is
-            raise _damaged(path, offset, f"a chunk is compressed with {chunk.compression!r}")
-        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-    except DamagedLogError:
-        raise
-    except Exception as error:  # each compressor raises errors of its own
-        raise _damaged(path, offset, f"a chunk cannot be unpacked ({error!r})") from error
-    if length != chunk.uncompressed_size:
-        raise _damaged(path, offset, "a chunk has another size than it claims")
-    return stream.read(length)
-
-
-def _frames(chunk: bytes, path: Path, offset: int) -> Iterator[tuple[int, int, int]]:
-    """Yield (opcode, start of content, length) of the records inside a chunk."""
-    position = 0
-    while position < len(chunk):
-        if position + _FRAME.size > len(chunk):
-            raise _damaged(path, offset, "a chunk ends inside a record")
-        opcode, length = _FRAME.unpack_from(chunk, position)
-        position += _FRAME.size
-        if length > len(chunk) - position:
-            raise _damaged(path, offset, "a record is longer than its chunk")
-        yield opcode, position, length
-        position += length
-
-
-def _take(
-    opcode: int,
-    body: memoryview,
-    schemas: dict[int, Schema],
-    channels: dict[int, Channel],
-    place: tuple[int, int],
-    path: Path,
-) -> Iterator[LoggedMessage]:
-    """Remember schemas and channels; yield messages. ``place``: chunk offset, start of content."""
-    if opcode == Opcode.SCHEMA:
-        schema = Schema.read(_stream(bytes(body)))
-        schemas[schema.id] = schema
-    elif opcode == Opcode.CHANNEL:
-        channel = Channel.read(_stream(bytes(body)))
-        channels[channel.id] = channel
-    elif opcode == Opcode.MESSAGE:
-        channel_id, _, log_time, publish_time = _MESSAGE.unpack_from(body)
-        known = channels.get(channel_id)
-        if known is None:
-            raise _damaged(path, place[0], f"a message names the unknown channel {channel_id}")
-        message_schema = schemas.get(known.schema_id)
-        yield LoggedMessage(
-            known.topic,
-            message_schema.name if message_schema else "",
-            known.message_encoding,
-            log_time,
-            publish_time,
-            bytes(body[_MESSAGE.size :]),
-            place[0],
-            place[1] + _MESSAGE.size,
-        )
-
-
-def _stream(data: bytes) -> ReadDataStream:
-    return ReadDataStream(BytesIO(data))
+    _, _, stored = _FOOTER.unpack_from(record, FRAME.size)
+    # the footer's own bytes up to the checksum belong to what is summed
+    if stored and zlib.crc32(record[: -CRC.size], checksum) != stored:
+        raise _damaged(path, start, "the summary fails its CRC")
 
 
 def _truncated(path: Path, offset: int) -> DamagedLogError:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.log import messages
+from tooltip_cli.log.annotations import BLACK, WHITE, rings
 from tooltip_cli.log.container import LoggedAttachment, iterate
 from tooltip_cli.log.messages import Message
 from tooltip_cli.log.writer import LogWriter
@@ -20,9 +21,6 @@ from tooltip_cli.method.detector import Detections
 TOPIC = "/tooltip/detections"
 ANNOTATIONS_TOPIC = "/tooltip/detection_annotations"
 PROVENANCE = "provenance.json"
-
-_BLACK = {"r": 0.0, "g": 0.0, "b": 0.0, "a": 1.0}
-_WHITE = {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0}
 
 
 def write_detections(
@@ -59,31 +57,12 @@ def write_detections(
             }
             payload = messages.encode(messages.TIP_DETECTION, fields)
             writer.write(Message(TOPIC, messages.TIP_DETECTION, stamp_ns, payload))
-            annotation = messages.encode(
-                messages.IMAGE_ANNOTATIONS, {"circles": _circles(stamp_ns, u, v)}
-            )
+            annotation = rings(stamp_ns, u, v, inner=BLACK, outer=WHITE)
             writer.write(
                 Message(ANNOTATIONS_TOPIC, messages.IMAGE_ANNOTATIONS, stamp_ns, annotation)
             )
         document = json.dumps(provenance, indent=1).encode()
         writer.attach(PROVENANCE, "application/json", document)
-
-
-def _circles(stamp_ns: int, u: float, v: float) -> list[dict[str, Any]]:
-    """Black ring in a white one, visible on any background; empty clears a flagged frame."""
-    if not np.isfinite(u):
-        return []
-    return [
-        {
-            "timestamp": messages.time_from_ns(stamp_ns),
-            # Foxglove counts pixels from the first one's corner, we from its centre
-            "position": {"x": u + 0.5, "y": v + 0.5},
-            "diameter": diameter,
-            "thickness": 1.5,
-            "outline_color": color,
-        }
-        for diameter, color in ((12.0, _BLACK), (15.0, _WHITE))
-    ]
 
 
 def read_provenance(path: Path) -> dict[str, Any] | None:
@@ -108,7 +87,7 @@ def read_detections(path: Path, stamps_ns: npt.NDArray[np.int64]) -> Detections:
         TooltipError: unreadable, or of another recording.
     """
     rows = [
-        messages.decode(messages.TIP_DETECTION, item.payload)
+        messages.decode_foreign(messages.TIP_DETECTION, item.payload, str(path))
         for item in iterate(path)
         if not isinstance(item, LoggedAttachment) and item.topic == TOPIC
     ]

@@ -74,7 +74,7 @@ def read_edges(path: Path, stamps_ns: npt.NDArray[np.int64]) -> MovingEdges:
         TooltipError: unreadable, malformed, or of another recording.
     """
     rows = [
-        _decode(item.payload, path)
+        messages.decode_foreign(MOVING_EDGES, item.payload, str(path))
         for item in iterate(path)
         if not isinstance(item, LoggedAttachment) and item.topic == TOPIC
     ]
@@ -98,12 +98,3 @@ def read_edges(path: Path, stamps_ns: npt.NDArray[np.int64]) -> MovingEdges:
             FrameEdges(affines, packed["pixel"], packed["translation"], packed["covariance"])
         )
     return join(index[:, 0], index[:, 1:], parts)
-
-
-def _decode(payload: bytes, path: Path) -> Any:
-    try:
-        return messages.decode(MOVING_EDGES, payload)
-    except Exception as error:  # the decoder meets arbitrary bytes
-        raise TooltipError(
-            f"{path} holds a message that is not of moving edges ({error!r})"
-        ) from error

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import re
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 
+from tooltip_cli.errors import TooltipError
 from tooltip_cli.resources import resource
 from tooltip_cli.rig.camera import CameraModel
 
@@ -25,6 +27,8 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 STRING = "std_msgs/msg/String"
 IMAGE_ANNOTATIONS = "foxglove_msgs/msg/ImageAnnotations"
+SCENE_UPDATE = "foxglove_msgs/msg/SceneUpdate"
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 TIP_DETECTION = "tooltip_msgs/msg/TipDetection"
 MOVING_EDGES = "tooltip_msgs/msg/MovingEdges"
 
@@ -41,6 +45,7 @@ class Message:
     log_time_ns: int  # when it was received; orders the log, nothing else
     payload: bytes  # CDR with its four-byte encapsulation header
     publish_time_ns: int | None = None  # None: the same as log_time_ns
+    qos: str | None = None  # offered_qos_profiles as YAML; None: this program's default
 
 
 def definition(datatype: str) -> str:
@@ -112,6 +117,21 @@ def decode(datatype: str, payload: bytes) -> Any:
     return _decoder(datatype)(payload)
 
 
+def decode_foreign(datatype: str, payload: bytes, source: str) -> Any:
+    """Decode a message that somebody else may have written.
+
+    Raises:
+        TooltipError: it is none of that type; ``source`` says where it stands.
+    """
+    try:
+        return decode(datatype, payload)
+    except Exception as error:  # the decoder meets arbitrary bytes
+        raise TooltipError(
+            f"{source}: a message is not a {datatype} ({error!r}); record it again, or leave the "
+            "topic out"
+        ) from error
+
+
 def time_from_ns(stamp_ns: int) -> dict[str, int]:
     """Return a ``builtin_interfaces/Time`` for integer nanoseconds."""
     sec, nanosec = divmod(int(stamp_ns), 1_000_000_000)
@@ -121,6 +141,14 @@ def time_from_ns(stamp_ns: int) -> dict[str, int]:
 def ns_from_time(time: Any) -> int:
     """Return integer nanoseconds for a decoded ``builtin_interfaces/Time``."""
     return int(time.sec) * 1_000_000_000 + int(time.nanosec)
+
+
+def header_stamp_ns(payload: bytes) -> int | None:
+    """Return the stamp of a message that begins with a std_msgs/Header; None: it is too short."""
+    if len(payload) < 12:
+        return None
+    sec, nanosec = struct.unpack_from("<iI" if payload[1] & 1 else ">iI", payload, 4)
+    return int(sec) * 1_000_000_000 + int(nanosec)
 
 
 def header(stamp_ns: int, frame_id: str = "") -> dict[str, Any]:

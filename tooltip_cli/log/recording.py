@@ -17,6 +17,7 @@ from tooltip_cli.errors import TooltipError
 from tooltip_cli.log import messages
 from tooltip_cli.log.container import LoggedAttachment, LoggedMessage, iterate, read_chunk
 from tooltip_cli.log.images import decode_compressed, decode_raw
+from tooltip_cli.log.messages import decode_foreign
 from tooltip_cli.log.sync import sorted_unique
 from tooltip_cli.log.topics import choose_info, choose_topic
 from tooltip_cli.rig.camera import CameraModel
@@ -112,7 +113,7 @@ class Recording:
         with self.path.open("rb") as file:
             for index in indices:
                 payload = _payload(file, self._places[index], cache, self.path)
-                yield _decode(self.image_type, payload, f"{self.path}: image {index}")
+                yield decode_foreign(self.image_type, payload, f"{self.path}: image {index}")
 
 
 def _payload(
@@ -129,11 +130,18 @@ def _payload(
     return cache[chunk_offset][offset : offset + length]
 
 
-def read_recording(path: Path, topics: Topics = Topics()) -> Recording:
+def read_recording(
+    path: Path,
+    topics: Topics = Topics(),
+    items: Iterable[LoggedMessage | LoggedAttachment] | None = None,
+) -> Recording:
     """Read one log: all small streams into memory, images as places in the file.
 
     What not every stage needs (joints, intrinsics, poses, robot) and cannot be taken is left out,
     and ``unusable`` says why, unless its topic was asked for by name.
+
+    Args:
+        items: what is left of a damaged file; default: the file, which must be whole.
 
     Raises:
         TooltipError: not a readable MCAP log; no image topic or several; a named topic that is
@@ -141,7 +149,7 @@ def read_recording(path: Path, topics: Topics = Topics()) -> Recording:
         DamagedLogError: truncated, or a checksum fails.
     """
     index = _Index(path)
-    for item in iterate(path):
+    for item in iterate(path) if items is None else items:
         index.add(item)
     image_topic = index.image_topic(topics.image)
     stamps, places, frame = index.image_stream(image_topic)
@@ -253,7 +261,7 @@ class _Index:
             return None
         cameras = []
         for payload in dict.fromkeys(map(_without_stamp, self._payloads[topic])):
-            message = _decode(messages.CAMERA_INFO, payload, f"{self.path}: {topic}")
+            message = decode_foreign(messages.CAMERA_INFO, payload, f"{self.path}: {topic}")
             cameras.append(messages.camera_from_info(message, f"{self.path}: {topic}"))
         if any(camera != cameras[0] for camera in cameras):
             raise TooltipError(
@@ -276,7 +284,7 @@ class _Index:
     def _joint_tracks(self, topic: str) -> dict[str, JointTrack]:
         samples: dict[str, tuple[list[int], list[float]]] = {}
         for payload in self._payloads[topic]:
-            message = _decode(messages.JOINT_STATE, payload, f"{self.path}: {topic}")
+            message = decode_foreign(messages.JOINT_STATE, payload, f"{self.path}: {topic}")
             stamp_ns = messages.ns_from_time(message.header.stamp)
             # positions may be left empty by a controller that reports only effort
             for name, position in zip(message.name, message.position, strict=False):
@@ -315,7 +323,7 @@ class _Index:
     def _pose_track(self, topic: str) -> PoseTrack:
         stamps, rows, frames, left_out = [], [], set(), 0
         for payload in self._payloads[topic]:
-            message = _decode(messages.POSE_STAMPED, payload, f"{self.path}: {topic}")
+            message = decode_foreign(messages.POSE_STAMPED, payload, f"{self.path}: {topic}")
             frames.add(str(message.header.frame_id))
             p, q = message.pose.position, message.pose.orientation
             row = np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
@@ -345,7 +353,9 @@ class _Index:
         texts = {}
         for topic in filter(lambda name: _is_description(name, self.types[name]), self.types):
             where = f"{self.path}: {topic}"
-            texts[topic] = str(_decode(messages.STRING, self._payloads[topic][-1], where).data)
+            texts[topic] = str(
+                decode_foreign(messages.STRING, self._payloads[topic][-1], where).data
+            )
         if len(set(texts.values())) > 1:
             raise TooltipError(
                 f"{self.path} has several robot descriptions: {', '.join(sorted(texts))}; name the "
@@ -362,16 +372,6 @@ class _Index:
         return order
 
 
-def _decode(datatype: str, payload: bytes, source: str) -> Any:
-    try:
-        return messages.decode(datatype, payload)
-    except Exception as error:  # the decoder meets arbitrary bytes
-        raise TooltipError(
-            f"{source}: a message is not a {datatype} ({error!r}); record it again, or leave the "
-            "topic out"
-        ) from error
-
-
 def _is_description(topic: str, datatype: str) -> bool:
     return datatype == messages.STRING and topic.rsplit("/", 1)[-1] == "robot_description"
 
@@ -386,17 +386,16 @@ def _read_header(item: LoggedMessage, path: Path) -> tuple[int, str]:
 
     Decoding the whole message would copy every image twice.
     """
+    stamp_ns = messages.header_stamp_ns(item.payload)
     try:
         order: Literal["little", "big"] = "little" if item.payload[1] & 1 else "big"
-        seconds = int.from_bytes(item.payload[4:8], order, signed=True)
-        nanoseconds = int.from_bytes(item.payload[8:12], order)
         length = int.from_bytes(item.payload[12:16], order)
         frame = item.payload[16 : 16 + max(length - 1, 0)].decode("utf-8")
-        if len(item.payload) < 16 + length:
+        if stamp_ns is None or len(item.payload) < 16 + length:
             raise ValueError("too short")
     except (IndexError, ValueError) as error:
         raise TooltipError(
             f"{path}: a message on {item.topic} is not a {item.datatype}; record it again, or "
             "leave the topic out"
         ) from error
-    return seconds * 1_000_000_000 + nanoseconds, frame
+    return stamp_ns, frame

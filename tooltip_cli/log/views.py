@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tooltip_cli.errors import TooltipError
-from tooltip_cli.log.recording import Recording
+from tooltip_cli.log.recording import JointTrack, Recording
 from tooltip_cli.log.sync import bracket, interpolate, interpolate_poses
 from tooltip_cli.rig.camera import CameraModel
 from tooltip_cli.rig.kinematics import (
@@ -143,7 +143,7 @@ def _check_image_size(recording: Recording, camera: CameraModel) -> None:
 
 
 def _from_joints(recording: Recording, rig: Rig, query_ns: Stamps) -> Array:
-    chain = _chain(recording, rig)
+    chain = resolve_chain(recording, rig)
     if not recording.joints:
         raise TooltipError(
             recording.unusable.get("joints")
@@ -151,11 +151,7 @@ def _from_joints(recording: Recording, rig: Rig, query_ns: Stamps) -> Array:
             "hand's pose is unknown; if it logs poses, name them under hand.pose_topic in the rig "
             "file"
         )
-    # a name that the rig maps stands for the URDF's joint alone
-    tracks = {name: track for name, track in recording.joints.items() if name not in rig.joints}
-    for logged, name in rig.joints.items():
-        if logged in recording.joints:
-            tracks[name] = recording.joints[logged]
+    tracks = urdf_tracks(recording, rig)
     _check_joints(recording, rig, chain.joint_names, tracks)
     needed = {name: tracks[name] for name in chain.joint_names}
     _check_overlap(
@@ -168,16 +164,41 @@ def _from_joints(recording: Recording, rig: Rig, query_ns: Stamps) -> Array:
     return chain.hand_from_camera(np.stack(positions, axis=1))
 
 
-def _chain(recording: Recording, rig: Rig) -> KinematicChain:
-    urdf = rig.urdf if rig.urdf is not None else recording.urdf
-    if urdf is None:
+def urdf_tracks(recording: Recording, rig: Rig) -> dict[str, JointTrack]:
+    """Return the logged joints by their names in the URDF."""
+    # a name that the rig maps stands for the URDF's joint alone
+    tracks = {name: track for name, track in recording.joints.items() if name not in rig.joints}
+    for logged, name in rig.joints.items():
+        if logged in recording.joints:
+            tracks[name] = recording.joints[logged]
+    return tracks
+
+
+def resolve_urdf(recording: Recording, rig: Rig) -> tuple[str, str]:
+    """Return the robot description, the rig's or else the log's, and what to call it.
+
+    Raises:
+        TooltipError: there is none.
+    """
+    if rig.urdf is not None:
+        return rig.urdf, rig.source
+    if recording.urdf is None:
         raise TooltipError(
             recording.unusable.get("robot")
             or f"{recording.path} has no /robot_description; name the URDF under 'robot' in "
             f"{rig.source}"
         )
+    return recording.urdf, f"{recording.path}: /robot_description"
+
+
+def resolve_chain(recording: Recording, rig: Rig) -> KinematicChain:
+    """Return the chain from the camera to the hand, by the rig's URDF or else the log's.
+
+    Raises:
+        TooltipError: there is none, or it lacks a frame.
+    """
+    urdf, source = resolve_urdf(recording, rig)
     camera_frame = rig.camera_frame or recording.image_frame
-    source = rig.source if rig.urdf is not None else f"{recording.path}: /robot_description"
     return KinematicChain.from_urdf(urdf, camera_frame, rig.hand_frame, rig.mount, source)
 
 

@@ -75,6 +75,28 @@ def rotation_from_quaternion(quaternion_xyzw: npt.ArrayLike) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def quaternion_from_rotation(rotation: Array) -> Array:
+    """Return (..., 4) unit quaternions (x, y, z, w) with w >= 0 for (..., 3, 3) rotations.
+
+    The largest of the four components is taken from the diagonal, the others from what is
+    symmetric and antisymmetric about it (Shepperd's method), which no angle makes inexact.
+    """
+    m = np.asarray(rotation, dtype=float)
+    diagonal = np.stack([m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]], axis=-1)
+    trace = diagonal.sum(axis=-1)
+    squares = np.concatenate([2 * diagonal - trace[..., None], trace[..., None]], axis=-1) + 1
+    q = np.empty((*squares.shape, 4))  # four candidates, each from another component
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        q[..., i, i] = squares[..., i]
+        q[..., i, j] = q[..., j, i] = m[..., i, j] + m[..., j, i]
+        q[..., i, 3] = q[..., 3, i] = m[..., k, j] - m[..., j, k]
+    q[..., 3, 3] = squares[..., 3]
+    best = np.argmax(squares, axis=-1)
+    chosen = np.take_along_axis(q, best[..., None, None], axis=-2)[..., 0, :]
+    chosen = np.where(chosen[..., 3:] < 0, -chosen, chosen)
+    return np.asarray(chosen / np.linalg.norm(chosen, axis=-1, keepdims=True))
+
+
 def inverse_transform(transform: Array) -> Array:
     """Return the inverse of (..., 4, 4) rigid transforms."""
     rotation = np.swapaxes(transform[..., :3, :3], -1, -2)
@@ -111,7 +133,7 @@ class KinematicChain:
         """
         import pinocchio
 
-        model = _build_model(pinocchio, urdf, source)
+        model = build_model(pinocchio, urdf, source)
         start = mount.parent if mount else camera_frame
         frame_ids = []
         for kind, name in (("camera", start), ("hand", hand_frame)):
@@ -140,6 +162,18 @@ class KinematicChain:
                 f"of the joints {', '.join(names)} has an axis or origin that no robot has"
             )
         return chain
+
+    @property
+    def limits(self) -> Array:
+        """(J, 2) lowest and highest position of each joint, rad or m; infinite where none is."""
+        limits = np.full((len(self.joint_names), 2), (-np.inf, np.inf))
+        for row, (column, size) in enumerate(self._columns):
+            if size == 1:
+                limits[row] = (
+                    self._model.lowerPositionLimit[column],
+                    self._model.upperPositionLimit[column],
+                )
+        return limits
 
     def hand_from_camera(self, positions: npt.ArrayLike) -> Array:
         """Return the transform T_c of the paper for each configuration.
@@ -171,7 +205,12 @@ class KinematicChain:
         return transforms @ self._frame_from_camera
 
 
-def _build_model(pinocchio: Any, urdf: str, source: str) -> Any:
+def build_model(pinocchio: Any, urdf: str, source: str) -> Any:
+    """Return Pinocchio's model of a URDF, which must declare no document type and no entities.
+
+    Raises:
+        TooltipError: it does, or Pinocchio cannot read it.
+    """
     if len(urdf) > _MAX_URDF_BYTES:
         raise TooltipError(f"{source}: the URDF has {len(urdf)} characters, too many to be one")
     if re.search(r"<!(DOCTYPE|ENTITY)", urdf, re.IGNORECASE):

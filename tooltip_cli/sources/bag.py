@@ -95,9 +95,8 @@ class BagSource:
             if payload is None:
                 continue
             self._report.count(stored.topic)
-            yield Message(
-                stored.topic, topic.datatype, stored.log_time_ns, payload, stored.publish_time_ns
-            )
+            times = stored.log_time_ns, stored.publish_time_ns
+            yield Message(stored.topic, topic.datatype, times[0], payload, times[1], topic.qos)
         if not self._report.read.get(self._image):
             reasons = "; ".join(f"{count} {why}" for why, count in self._report.dropped.items())
             raise TooltipError(f"{self._path}: no image on {self._image} can be kept ({reasons})")

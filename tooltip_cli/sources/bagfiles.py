@@ -7,6 +7,7 @@ message; SQLite and ROS 1 are read with ``rosbags``.
 from __future__ import annotations
 
 import contextlib
+import shutil
 import tempfile
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -14,7 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from tooltip_cli.errors import TooltipError
-from tooltip_cli.log.container import MAGIC, LoggedMessage, iterate, open_log
+from tooltip_cli.log.container import LoggedMessage, iterate, open_log
+from tooltip_cli.log.mcapfile import MAGIC
+from tooltip_cli.log.qos import known_qos, latched_qos, qos_of_profiles
+from tooltip_cli.log.records import MAX_RECORD_BYTES, unpack_zstd
 from tooltip_cli.rig.documents import parse_yaml
 from tooltip_cli.sources.streams import missing_extra, one_line
 
@@ -29,6 +33,8 @@ _ROS1_MAGIC = b"#ROSBAG V"
 _KINDS = {".mcap": "mcap", ".db3": "sqlite3"}
 _COMPRESSED = ".zstd"
 _BLOCK_BYTES = 1 << 20
+_LEAVE_BYTES = 100_000_000
+_QOS = "offered_qos_profiles"
 _URI_CHARACTERS = frozenset("?#%")  # rosbags puts the path into an SQLite URI as it is
 
 
@@ -39,6 +45,7 @@ class StoredTopic:
     datatype: str  # ROS 2 type name; several joined by " and " where publishers disagree
     encoding: str  # "cdr", "ros1" or what the file says
     count: int  # messages
+    qos: str | None = None  # offered_qos_profiles as YAML; None: not known
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,10 +184,10 @@ class Ros2Bag:
                     yield self._unpacked(message, path) if self._per_message else message
 
     def _unpacked(self, message: StoredMessage, path: Path) -> StoredMessage:
-        import zstandard
-
         with _reading(path, "zstd-compressed ROS 2 bag"):
-            payload = zstandard.ZstdDecompressor().decompress(message.payload)
+            payload = unpack_zstd(message.payload, MAX_RECORD_BYTES)
+            if len(payload) > MAX_RECORD_BYTES:
+                raise ValueError(f"a message of more than {MAX_RECORD_BYTES} bytes")
         times = message.log_time_ns, message.publish_time_ns
         return StoredMessage(message.topic, *times, payload)
 
@@ -197,7 +204,9 @@ class Ros1Bag:
         merged: dict[str, StoredTopic] = {}
         with _reading(self._path, "ROS 1 bag"), self._reader() as reader:
             for connection in reader.connections:
-                found = StoredTopic(connection.msgtype, "ros1", connection.msgcount)
+                # a default serves publishers that do not latch
+                qos = latched_qos() if getattr(connection.ext, "latching", None) else None
+                found = StoredTopic(connection.msgtype, "ros1", connection.msgcount, qos)
                 merged[connection.topic] = _merge(merged.get(connection.topic), found)
         return merged
 
@@ -260,6 +269,7 @@ def _merge(known: StoredTopic | None, found: StoredTopic) -> StoredTopic:
         " and ".join(dict.fromkeys([*known.datatype.split(" and "), found.datatype])),
         " and ".join(dict.fromkeys([*known.encoding.split(" and "), found.encoding])),
         known.count + found.count,
+        known.qos or found.qos,
     )
 
 
@@ -276,7 +286,8 @@ def _mcap_topics(plain: Path, path: Path) -> Iterator[tuple[str, StoredTopic]]:
         return
     for item in iterate(plain):
         if isinstance(item, LoggedMessage):
-            yield item.topic, StoredTopic(_ros2_name(item.datatype), item.encoding, 1)
+            qos = known_qos(item.channel.metadata.get(_QOS, ""))
+            yield item.topic, StoredTopic(_ros2_name(item.datatype), item.encoding, 1, qos)
 
 
 def _mcap_summary(plain: Path) -> list[tuple[str, StoredTopic]] | None:
@@ -297,7 +308,8 @@ def _mcap_summary(plain: Path) -> list[tuple[str, StoredTopic]] | None:
         if channel is None or (schema is None and channel.schema_id):
             return None
         datatype = _ros2_name(schema.name) if schema is not None else ""
-        topics.append((channel.topic, StoredTopic(datatype, channel.message_encoding, count)))
+        qos = known_qos(channel.metadata.get(_QOS, ""))
+        topics.append((channel.topic, StoredTopic(datatype, channel.message_encoding, count, qos)))
     return topics
 
 
@@ -311,7 +323,8 @@ def _sqlite_topics(plain: Path, path: Path) -> Iterator[tuple[str, StoredTopic]]
     with _reading(path, "ROS 2 SQLite bag"), _sqlite_reader(plain) as reader:
         for item in reader.connections:
             encoding = str(getattr(item.ext, "serialization_format", ""))
-            yield item.topic, StoredTopic(_ros2_name(item.msgtype), encoding, item.msgcount)
+            qos = qos_of_profiles(getattr(item.ext, "offered_qos_profiles", None) or [])
+            yield item.topic, StoredTopic(_ros2_name(item.msgtype), encoding, item.msgcount, qos)
 
 
 def _sqlite_messages(plain: Path, path: Path, wanted: Collection[str]) -> Iterator[StoredMessage]:
@@ -372,6 +385,8 @@ def _plain(path: Path) -> Iterator[Path]:
             frame = zstandard.ZstdDecompressor().decompressobj()
             while block := packed.read(_BLOCK_BYTES):
                 out.write(frame.decompress(block))
+                if shutil.disk_usage(folder).free < _LEAVE_BYTES:
+                    raise ValueError("it unpacks to more than the temporary directory can hold")
         if not frame.eof:
             raise TooltipError(f"{path} is truncated: its compressed data do not end")
         try:

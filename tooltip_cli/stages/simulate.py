@@ -12,6 +12,8 @@ from typing import Any
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.labels.files import write_labels
 from tooltip_cli.log.container import LoggedAttachment, iterate
+from tooltip_cli.log.crashsafe import MIN_FREE_BYTES
+from tooltip_cli.log.stopping import Stop
 from tooltip_cli.sources.base import SourceReport
 from tooltip_cli.sources.sim import SimParams
 from tooltip_cli.sources.simulated import TRUTH_FILE, SimSource
@@ -36,6 +38,9 @@ def record_simulation(
     *,
     jobs: int = 1,
     overwrite: bool = False,
+    min_free_bytes: int = MIN_FREE_BYTES,
+    stop: Stop | None = None,
+    keep_unfinished: bool = True,
     on_image: Callable[[], None] = lambda: None,
 ) -> Simulated:
     """Simulate a recording and write it and ``STEM.labels.csv`` beside it.
@@ -44,6 +49,9 @@ def record_simulation(
         jobs: threads that render; the result does not depend on them.
         on_image: called after every image, for progress.
 
+    The other arguments are those of :func:`tooltip_cli.stages.record.record`, and so is what
+    happens when it is cut short; there are then no labels.
+
     Raises:
         TooltipError: the simulation cannot be set up, or a file exists or cannot be written.
     """
@@ -51,7 +59,15 @@ def record_simulation(
     if labels.exists() and not overwrite:
         raise TooltipError(f"{labels} exists; give another name, or --force to replace it")
     source = SimSource(params, jobs)
-    record(source, out, overwrite=overwrite, on_image=on_image)
+    record(
+        source,
+        out,
+        overwrite=overwrite,
+        min_free_bytes=min_free_bytes,
+        stop=stop,
+        keep_unfinished=keep_unfinished,
+        on_image=on_image,
+    )
     write_labels(labels, source.labels())
     return Simulated(out, labels, False, source.report)
 
@@ -76,7 +92,14 @@ def reuse_simulation(
         labels = _labels_of(out)
         if labels.exists():
             return Simulated(out, labels, True, SourceReport())
-    return record_simulation(params, out, jobs=jobs, overwrite=known or force, on_image=on_image)
+    return record_simulation(
+        params,
+        out,
+        jobs=jobs,
+        overwrite=known or force,
+        keep_unfinished=False,
+        on_image=on_image,
+    )
 
 
 def _labels_of(recording: Path) -> Path:

@@ -1,0 +1,125 @@
+"""The export stage: the estimate where people take it next."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from tooltip_cli.errors import RefusedError, TooltipError
+from tooltip_cli.log.recording import Recording, Topics, read_recording
+from tooltip_cli.log.scene import transform_stamped
+from tooltip_cli.log.views import Views, resolve_rig, resolve_urdf, resolve_views
+from tooltip_cli.log.whole import check_absent
+from tooltip_cli.method.estimators import EstimatorParams
+from tooltip_cli.method.types import Array
+from tooltip_cli.rig.rigfile import Rig
+from tooltip_cli.rig.tool_tip import TIP_LINK, urdf_with_tip
+from tooltip_cli.stages.artifacts import write_whole
+from tooltip_cli.stages.estimate import Estimated, estimate_from_images
+from tooltip_cli.stages.held_out import unlabelled
+
+
+@dataclass(frozen=True)
+class Result:
+    """A recording with its estimate, which may be a refusal."""
+
+    recording: Recording
+    rig: Rig
+    views: Views
+    estimated: Estimated
+
+    @property
+    def position(self) -> Array:
+        """(3,) the tip, metres, hand frame.
+
+        Raises:
+            RefusedError: there is no trustworthy one.
+        """
+        estimate = self.estimated.estimate
+        if estimate.position is None:
+            reasons = "; ".join(f"{reason.code}: {reason.text}" for reason in estimate.reasons)
+            raise RefusedError(f"{self.recording.path} has no estimate to export ({reasons})")
+        return estimate.position
+
+
+def open_result(
+    path: Path,
+    *,
+    rig: Path | None = None,
+    topics: Topics | None = None,
+    params: EstimatorParams | None = None,
+    out: Path | None = None,
+    jobs: int = 1,
+    on_pair: Callable[[], None] = lambda: None,
+) -> Result:
+    """Read a recording and its estimate, which is made first where it is missing or out of date.
+
+    Args:
+        out: directory of the results; default: beside the recording.
+
+    Raises:
+        TooltipError: anything wrong with the inputs.
+    """
+    recording = read_recording(path, topics or Topics())
+    resolved = resolve_rig(recording, rig)
+    views = resolve_views(recording, resolved)
+    allowed = unlabelled(recording, views.camera, out)
+    estimated = estimate_from_images(
+        recording, views, params or EstimatorParams(), allowed, out=out, jobs=jobs, on_pair=on_pair
+    )
+    return Result(recording, resolved, views, estimated)
+
+
+def export_urdf(result: Result, path: Path, *, overwrite: bool = False) -> None:
+    """Write the robot with the link ``tool_tip`` fixed to the hand.
+
+    Raises:
+        TooltipError: no robot description, one that has such a link, or the file cannot be
+            written.
+        RefusedError: there is no estimate.
+    """
+    check_absent(path, overwrite=overwrite)
+    if result.recording.pose_topic or result.rig.pose_topic:
+        raise TooltipError(
+            f"{result.recording.path} logs hand poses, so there is no URDF to add the tip to; "
+            "take --tf instead"
+        )
+    urdf, source = resolve_urdf(result.recording, result.rig)
+    write_whole(path, urdf_with_tip(urdf, result.rig.hand_frame, result.position, source))
+
+
+def tip_transform(result: Result) -> dict[str, Any]:
+    """Return the ``geometry_msgs/TransformStamped`` from the hand to the tip.
+
+    The tip has the hand's orientation: what is estimated is a point.
+
+    Raises:
+        RefusedError: there is no estimate.
+    """
+    hand_from_tip = np.eye(4)
+    hand_from_tip[:3, 3] = np.round(result.position, 6)  # micrometres are enough for anybody
+    return transform_stamped(0, result.rig.hand_frame, TIP_LINK, hand_from_tip)
+
+
+def transform_text(transform: dict[str, Any]) -> str:
+    """Return the command that publishes a transform, and the same as YAML, as two YAML documents.
+
+    Source: ``static_transform_publisher``, ROS 2 Humble and later.
+    """
+    translation = transform["transform"]["translation"]
+    rotation = transform["transform"]["rotation"]
+    options = {
+        **{f"--{axis}": repr(translation[axis]) for axis in "xyz"},
+        **{f"--q{axis}": repr(rotation[axis]) for axis in "xyzw"},
+        "--frame-id": transform["header"]["frame_id"],
+        "--child-frame-id": transform["child_frame_id"],
+    }
+    words = [word for name, value in options.items() for word in (name, shlex.quote(value))]
+    command = "ros2 run tf2_ros static_transform_publisher " + " ".join(words)
+    return f"{command}\n---\n{yaml.safe_dump(transform, sort_keys=False)}"
