@@ -19,6 +19,7 @@ COMMANDS = {
     "record": "Record or import images and joint angles into an MCAP log.",
     "detect": "Find the tip's pixel in each frame by motion.",
     "estimate": "Find the 3D tip in the hand frame.",
+    "label": "Label the tip in the test frames, in the browser.",
     "evaluate": "Measure the estimate against hand labels and write a report.",
     "compare": "Compare reports, frame by frame.",
     "demo": "Simulate recordings and take them through every stage.",
