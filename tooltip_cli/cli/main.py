@@ -22,6 +22,7 @@ COMMANDS = {
     "salvage": "Recover what is intact of a damaged recording.",
     "detect": "Find the tip's pixel in each frame by motion.",
     "estimate": "Find the 3D tip in the hand frame.",
+    "label": "Label the tip in the test frames, in the browser.",
     "evaluate": "Measure the estimate against hand labels and write a report.",
     "calibrate": "Find clock offset and camera pose from recordings of one robot.",
     "compare": "Compare reports, frame by frame.",
