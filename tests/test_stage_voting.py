@@ -235,3 +235,21 @@ def test_refining_needs_images(run: Run) -> None:
     wrong = tooltip("estimate", run.recording, "--method", "kmeans", "--refine", "time")
     assert wrong.code == 2
     assert "voting" in wrong.err
+
+
+def test_the_cloud_shows_the_tool_up_to_its_tip(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "tool.ply"
+    done = tooltip("export", run.recording, "--cloud", path)
+    assert done.code == 0, done.err
+    head, body = path.read_bytes().split(b"end_header\n", 1)
+    (count,) = (int(line.split()[2]) for line in head.splitlines() if b"element vertex" in line)
+    layout = np.dtype([("point", "<f4", 3), ("color", "u1", 3), ("frames", "<i4")])
+    rows = np.frombuffer(body, dtype=layout)
+    assert len(rows) == count > 100
+    tip = np.array(run.document["tip"]["position_m"])
+    np.testing.assert_allclose(rows["point"][-1], tip, atol=1e-6)
+    assert rows["color"][-1].tolist() == [255, 0, 0]
+    assert np.linalg.norm(rows["point"][:-1] - tip, axis=1).min() < 0.008
+    again = tooltip("export", run.recording, "--cloud", path)
+    assert again.code == 1
+    assert "--force" in again.err
