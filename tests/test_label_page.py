@@ -456,6 +456,20 @@ def test_an_image_that_cannot_be_decoded_is_said(browser: Any, tmp_path: Path) -
 # Reload, tabs, crashes.
 
 
+def test_a_point_is_repeated_also_after_a_reload(hand: Hand, served: Served) -> None:
+    hand.key("r")
+    assert hand.page.locator("#message").inner_text() == "No point has been placed yet."
+    hand.click(*hand.fitted((50, 60), SIZE))
+    hand.key("f", "q", "f")
+    hand.saved()
+    hand.page.goto("about:blank")
+    hand.open(served.url)
+    assert hand.frame == "Frame 3 of 40"
+    hand.key("r")
+    hand.saved()
+    assert served.label(2) == served.label(0)
+
+
 def test_a_reload_resumes(hand: Hand, served: Served) -> None:
     hand.key("q", "f", "o", "f", "f")
     hand.saved()
