@@ -148,7 +148,11 @@ def test_a_click_is_right_to_a_fraction_of_a_pixel_at_every_zoom(
     ratio: float, browser: Any, tmp_path: Path
 ) -> None:
     path = dot_log(tmp_path / "dot.mcap")
-    with serving(path) as served, tab(browser, device_scale_factor=ratio) as page:
+    small = {"width": 800, "height": 500}  # less to take pictures of
+    with (
+        serving(path) as served,
+        tab(browser, device_scale_factor=ratio, viewport=small) as page,
+    ):
         hand = Hand(page).open(served.url)
         for _ in range(6):
             place = hand.fitted(DOT, SIZE) if hand.actions == 0 else dot_on(page)
@@ -159,8 +163,8 @@ def test_a_click_is_right_to_a_fraction_of_a_pixel_at_every_zoom(
             scale = hand.zoom
             assert label.pixel == pytest.approx(DOT, abs=0.6 / scale), f"at {scale}"
             hand.key("Delete")
-            hand.wheel(place[0] + 40, place[1] - 25, -240)
-        assert scale > 15
+            hand.wheel(place[0] + 20, place[1] - 12, -240)
+        assert scale > 10
 
 
 @pytest.mark.parametrize("orientation", [3, 6])
@@ -454,6 +458,20 @@ def test_an_image_that_cannot_be_decoded_is_said(browser: Any, tmp_path: Path) -
 
 
 # Reload, tabs, crashes.
+
+
+def test_a_point_is_repeated_also_after_a_reload(hand: Hand, served: Served) -> None:
+    hand.key("r")
+    assert hand.page.locator("#message").inner_text() == "No point has been placed yet."
+    hand.click(*hand.fitted((50, 60), SIZE))
+    hand.key("f", "q", "f")
+    hand.saved()
+    hand.page.goto("about:blank")
+    hand.open(served.url)
+    assert hand.frame == "Frame 3 of 40"
+    hand.key("r")
+    hand.saved()
+    assert served.label(2) == served.label(0)
 
 
 def test_a_reload_resumes(hand: Hand, served: Served) -> None:

@@ -99,6 +99,13 @@ def test_images_pass_byte_for_byte(served: Served) -> None:
         assert answer.body == jpeg_of(frame)
 
 
+def test_a_recording_that_vanishes_is_said(served: Served) -> None:
+    served.session.recording.path.unlink()
+    answer = ask(served.url, f"{root(served)}image/0")
+    assert answer.status == 500
+    assert "cannot be read any more" in answer.document["error"]
+
+
 def test_raw_images_become_png(tmp_path: Path) -> None:
     parts = wrist_parts(3)
     parts["images"] = [raw_image(frame) for frame in range(3)]

@@ -155,7 +155,10 @@ def _image(images: frozenset[int], session: Session, request: Request, body: byt
     if index not in images:
         return JSONResponse({"error": "no such image"}, 404)
     recording = session.recording
-    (message,) = recording.image_messages([index])
+    try:
+        (message,) = recording.image_messages([index])
+    except OSError as error:
+        raise TooltipError(f"{recording.path}: cannot be read any more ({error})") from error
     data, media_type = viewable(message, recording.image_type, f"{recording.path}: image {index}")
     return Response(data, media_type=media_type)
 

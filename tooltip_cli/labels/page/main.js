@@ -101,6 +101,14 @@ function nudge(event, [du, dv]) {
   put([pixel[0] + du, pixel[1] + dv], event.repeat);
 }
 
+// The point that was placed last; after a reload, that of the nearest frame before.
+function repeat() {
+  const before = frames.slice(0, current).map((frame) => placed(frame.label)).filter(Boolean);
+  const pixel = last ?? before.at(-1);
+  if (pixel) put(pixel);
+  else message("No point has been placed yet.");
+}
+
 function travel(place, nothing) {
   if (place === undefined) message(nothing);
   else if (place !== current) go(place);
@@ -124,7 +132,7 @@ const actions = {
   nudge,
   occluded: () => mark("occluded"),
   out: () => mark("out_of_view"),
-  repeat: () => (last ? put(last) : message("No point has been placed yet.")),
+  repeat,
   remove: () => set(null),
   undo: () => saver.broken || travel(labels.undo(), "There is nothing to undo."),
   redo: () => saver.broken || travel(labels.redo(), "There is nothing to redo."),
