@@ -3,34 +3,32 @@
 The sums of absolute differences (SADs) of sixteen neighbouring displacements are formed side by
 side in the 16-bit lanes of a vector. Numba's loops are not turned into such code by LLVM, so the
 part that matters is handed to LLVM as vector code (`match_edge`): portable vectors, which become
-whatever the processor has, and on x86 the instruction ``mpsadbw``, which forms the SADs of four
-pixels at eight (SSE4.1) or sixteen (AVX2) displacements at once.
+whatever the processor has, and on x86 the instructions ``mpsadbw`` and ``vdbpsadbw``, which form
+the SADs of four pixels at eight (SSE4.1) or sixteen (AVX2, AVX-512) displacements at once.
 
-This module imports numba; import it only where `_jit.numba_available` has said yes. The kernel and
-the vector code stay in one file because numba's cache on disk notices changes in the kernel's own
-file only.
+This module imports numba; `machine_code` imports it where there is something to compile, and
+notices changes in this file only.
 """
 
 from __future__ import annotations
 
 import functools
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
-from tooltip_cli.method import _jit
+from tooltip_cli.method.blocks import Form
 
-_PORTABLE_LANES = 16
 _BLOCK_ROWS_AT_ONCE = 55  # rows of blocks, 11 displacements of 5, in code without a loop
+
+# For `vdbpsadbw`, which lays pixels 0-3, 4-7, 4-7 and 8-11 of each half out before it compares.
+_SLIDING = 0x94
 
 _Image = tuple[Any, Any]  # address of a pixel, bytes from one row to the next
 _Rows = Sequence[tuple[list[Any], list[Any]]]  # quads and spare columns of rows of pixels
@@ -38,22 +36,11 @@ _Rows = Sequence[tuple[list[Any], list[Any]]]  # quads and spare columns of rows
 _BYTE, _LANE, _WORD, _INDEX = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 
 
-def mpsadbw_lanes() -> int:
-    """Return how many SADs one ``mpsadbw`` gives on the processor numba compiles for.
-
-    16 with AVX2, 8 with SSE4.1, 0 where there is no such instruction.
-    """
-    features = cpu_target.target_context.codegen().magic_tuple()[2].split(",")
-    if "+avx2" in features:
-        return 16
-    return 8 if "+sse4.1" in features else 0
-
-
 class _EdgeCode:
     """Writes the vector code that matches one edge.
 
-    Of the block's columns ``mpsadbw`` takes four at a time (a quad); the spare ones, which are all
-    of them in portable code, add |a - b| = 2 max(a, b) - a - b, one instruction fewer for every
+    Of the block's columns the instructions take four at a time (a quad); the spare ones, which are
+    all of them in portable code, add |a - b| = 2 max(a, b) - a - b, one instruction fewer for every
     pixel than a difference and its absolute value. Where the last quad lacks a column (blocks of
     3, 7, 11, 15), zeros fill it, and what they add, the second image's pixels, is subtracted as -b
     of a spare column.
@@ -65,11 +52,11 @@ class _EdgeCode:
         spare: spare columns.
     """
 
-    def __init__(self, builder: Any, block: int, search: int, mpsadbw: int) -> None:
-        self.builder, self.block, self.search = builder, block, search
-        self.lanes = mpsadbw or _PORTABLE_LANES
+    def __init__(self, builder: Any, block: int, search: int, form: Form) -> None:
+        self.builder, self.block, self.search, self.form = builder, block, search, form
+        self.lanes = form.lanes
         self.pieces = -(-search // self.lanes)
-        self.quads = range(0, block - 2, 4) if mpsadbw else range(0)
+        self.quads = range(0) if form is Form.PORTABLE else range(0, block - 2, 4)
         taken = 4 * len(self.quads)
         self.spare = range(min(block, taken), max(block, taken))
         self.vector = ir.VectorType(_LANE, self.lanes)
@@ -143,18 +130,24 @@ class _EdgeCode:
         ]
         return quads, spare
 
+    def quad_sads(self, row: Any, quad: Any) -> Any:
+        """The SADs of a quad of the block at neighbouring displacements along a row of pixels."""
+        if self.form is Form.AVX512:
+            name = "llvm.x86.avx512.dbpsadbw.256"
+            return self.call(name, self.vector, quad, row, _WORD(_SLIDING))
+        name = "llvm.x86.avx2.mpsadbw" if self.form is Form.AVX2 else "llvm.x86.sse41.mpsadbw"
+        return self.call(name, self.vector, row, quad, _BYTE(0))
+
     def sad_rows(self, block_rows: _Rows, window_rows: _Rows) -> list[Any]:
         """The SADs of neighbouring rows of displacements, from all rows of pixels they need."""
         builder, zero = self.builder, self.vector([0] * self.lanes)
-        mpsadbw = "llvm.x86.avx2.mpsadbw" if self.lanes == 16 else "llvm.x86.sse41.mpsadbw"
         count = len(window_rows) - self.block + 1
         sums, maxima = [zero] * count, [zero] * count
         for y, (quads, spare) in enumerate(window_rows):
             for dv in range(max(0, y - self.block + 1), min(count, y + 1)):
                 block_quads, block_spare = block_rows[y - dv]
                 for theirs, ours in zip(quads, block_quads, strict=True):
-                    part = self.call(mpsadbw, self.vector, theirs, ours, _BYTE(0))
-                    sums[dv] = builder.add(sums[dv], part)
+                    sums[dv] = builder.add(sums[dv], self.quad_sads(theirs, ours))
                 for theirs, ours in zip(spare, block_spare, strict=False):
                     maxima[dv] = builder.add(maxima[dv], self.pick("smax", theirs, ours))
         totals = [functools.reduce(builder.add, spare) for _, spare in window_rows]
@@ -254,144 +247,128 @@ class _EdgeCode:
 def _match_edge(
     _typing: Any,
     first: Any,
+    block_at: Any,
     first_stride: Any,
-    window: Any,
-    window_stride: Any,
+    second: Any,
+    window_at: Any,
+    second_stride: Any,
     ranks: Any,
     excess: Any,
     block: Any,
     search: Any,
-    mpsadbw: Any,
+    form: Any,
 ) -> Any:
     """Match one edge, in numba code.
 
     Args:
-        first: address of the block's top left pixel in the first image.
+        first: the first image, by its address.
+        block_at: where in it the block's top left pixel is.
         first_stride: bytes from one row of it to the next.
-        window: address of the search window's top left pixel in the second image.
-        window_stride: bytes from one row of it to the next.
-        ranks: address of a `rank_table`.
+        second: the second image, or the scratch copy of the window, likewise.
+        window_at: where in it the search window's top left pixel is.
+        second_stride: bytes from one row of it to the next.
+        ranks: a `blocks.rank_table`, by its address.
         excess: how much a SAD may exceed the lowest one and still count as similar.
-        block, search, mpsadbw: the constants of `matcher`.
+        block, search, form: the constants of `matcher`.
 
     Returns:
         The lowest SAD, its rank, and the six sums of `_EdgeCode.moments`.
     """
-    constants = [constant.literal_value for constant in (block, search, mpsadbw)]
+    constants = [constant.literal_value for constant in (block, search, form)]
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        block_at, window_at, ranks_at = (
-            builder.inttoptr(values[index], _BYTE.as_pointer()) for index in (0, 2, 4)
-        )
-        numbers = _EdgeCode(builder, *constants).match(
-            (block_at, values[1]), (window_at, values[3]), ranks_at, values[5]
-        )
+        code = _EdgeCode(builder, *constants[:2], Form(constants[2]))
+        block_image = (builder.gep(values[0], [values[1]]), values[2])
+        window_image = (builder.gep(values[3], [values[4]]), values[5])
+        ranks_at = builder.bitcast(values[6], _BYTE.as_pointer())
+        numbers = code.match(block_image, window_image, ranks_at, values[7])
         return context.make_tuple(builder, signature.return_type, numbers)
 
-    signature = types.UniTuple(types.int64, 8)(*[types.int64] * 6, block, search, mpsadbw)
+    pixels, ranks = types.CPointer(types.uint8), types.CPointer(types.uint16)
+    image = [pixels, types.int64, types.int64]
+    constant_types = [block, search, form]
+    signature = types.UniTuple(types.int64, 8)(*image, *image, ranks, types.int64, *constant_types)
     return signature, generate
 
 
 match_edge = intrinsic(prefer_literal=True)(_match_edge)
 
 
-def rank_table(displacements: npt.NDArray[np.int32], mpsadbw: int) -> npt.NDArray[np.uint16]:
-    """Return the (search, lanes) ranks of the displacements, filled up to whole vectors."""
-    search = math.isqrt(len(displacements))
-    lanes = mpsadbw or _PORTABLE_LANES
-    table = np.full((search, -(-search // lanes) * lanes), 0xFFFF, np.uint16)
-    column, row = displacements.T + search // 2
-    table[row, column] = np.arange(len(displacements))
-    return table
+def matcher(block: int, search: int, form: int) -> Callable[..., int]:
+    """Return the loop over the edges for one size of block and search window, to be compiled.
 
-
-def row_bytes(block: int, search: int) -> int:
-    """Return how many bytes `match_edge` may read from the start of each row of a window."""
-    return search + block + 32
-
-
-_IMAGE = types.Array(types.uint8, 2, "C", readonly=True)
-_PAIRS = types.Array(types.int32, 2, "C", readonly=True)
-_SIGNATURE = types.int64(
-    _IMAGE,
-    _IMAGE,
-    _PAIRS,
-    _PAIRS,
-    types.int64,
-    types.float64,
-    _PAIRS,
-    types.uint16[:, ::1],
-    types.uint8[:, ::1],
-    types.int32[:, ::1],
-    types.int32[::1],
-    types.float64[:, ::1],
-)
-
-
-@functools.cache
-def matcher(block: int, search: int, mpsadbw: int) -> Callable[..., int]:
-    """Return the compiled loop over the edges for one size of block and search window.
-
-    Its arguments are the two images, (N, 2) edges, (N, 2) or (0, 2) offsets, the excess of
-    `match_edge`, alpha, the (search^2, 2) displacements in the order in which ties are decided,
-    their `rank_table`, a scratch array of search + block - 1 rows of `row_bytes`, and the (N, 2),
-    (N,) and (N, 3) results to fill. It returns the index of the first edge whose block or window
+    Its arguments are what `blocks._match_compiled` gives: the two images and their size; N edges
+    and, unless ``moved`` is 0, as many offsets, all as u, v; the excess of `match_edge`; alpha; the
+    displacements in the order in which ties are decided, and their `blocks.rank_table`; how many
+    bytes `match_edge` may read from the start of a window's row, and scratch space for a window of
+    such rows; and the results to fill. It returns the index of the first edge whose block or window
     leaves the image, or -1.
 
     Args:
         block: side of the blocks, pixels; odd, 3 to 15.
         search: side of the search window, pixels; odd, 3 to 71.
-        mpsadbw: what `mpsadbw_lanes` says, or 0 for portable code.
+        form: the `blocks.Form` of the code.
     """
     half, margin = block // 2, block // 2 + search // 2
-    side, reach = 2 * margin + 1, row_bytes(block, search)
+    side = 2 * margin + 1
 
     def match_all(
         first: Any,
         second: Any,
+        height: int,
+        width: int,
         edges: Any,
+        count: int,
         offsets: Any,
-        excess: Any,
-        alpha: Any,
+        moved: int,
+        excess: int,
+        alpha: float,
         displacements: Any,
         ranks: Any,
+        reach: int,
         scratch: Any,
         translations: Any,
         sad: Any,
         covariances: Any,
     ) -> int:
-        height, width = second.shape
-        first_at, second_at = np.int64(first.ctypes.data), np.int64(second.ctypes.data)
-        scratch_at, ranks_at = np.int64(scratch.ctypes.data), np.int64(ranks.ctypes.data)
-        for i in range(edges.shape[0]):
-            u, v = np.int64(edges[i, 0]), np.int64(edges[i, 1])
+        for i in range(count):
+            u, v = np.int64(edges[2 * i]), np.int64(edges[2 * i + 1])
             if u < half or v < half or u >= width - half or v >= height - half:
                 return i
             du, dv = np.int64(0), np.int64(0)
-            if offsets.shape[0] > 0:
-                du, dv = np.int64(offsets[i, 0]), np.int64(offsets[i, 1])
+            if moved > 0:
+                du, dv = np.int64(offsets[2 * i]), np.int64(offsets[2 * i + 1])
             left, top = u + du - margin, v + dv - margin
             if left < 0 or top < 0 or left + side > width or top + side > height:
                 return i
-            window, stride = second_at + top * width + left, width
-            if (top + side - 1) * width + left + reach > second.size:
+            image, window, stride = second, top * width + left, width
+            if (top + side - 1) * width + left + reach > height * width:
                 # Vectors read beyond the window's last column; here that would leave the image.
                 for y in range(side):
                     for x in range(side):
-                        scratch[y, x] = second[top + y, left + x]
-                window, stride = scratch_at, scratch.shape[1]
-            block_at = first_at + (v - half) * width + u - half
+                        scratch[y * reach + x] = second[(top + y) * width + left + x]
+                image, window, stride = scratch, np.int64(0), reach
             least, rank, n, x, xx, k, kx, kk = match_edge(
-                block_at, width, window, stride, ranks_at, excess, block, search, mpsadbw
+                first,
+                (v - half) * width + u - half,
+                width,
+                image,
+                window,
+                stride,
+                ranks,
+                excess,
+                block,
+                search,
+                form,
             )
-            bu, bv = np.int64(displacements[rank, 0]), np.int64(displacements[rank, 1])
-            translations[i, 0], translations[i, 1] = du + bu, dv + bv
+            bu, bv = np.int64(displacements[2 * rank]), np.int64(displacements[2 * rank + 1])
+            translations[2 * i], translations[2 * i + 1] = du + bu, dv + bv
             sad[i] = least
             # Scatter around the best match, in integers until the division; bk is its row's k.
             bk = search - search // 2 - bv
-            covariances[i, 0] = alpha + (xx - 2 * bu * x + n * bu * bu) / n
-            covariances[i, 1] = (bk * x - kx + bu * k - n * bu * bk) / n
-            covariances[i, 2] = alpha + (2 * kk - k - 2 * bk * k + n * bk * bk) / n
+            covariances[3 * i] = alpha + (xx - 2 * bu * x + n * bu * bu) / n
+            covariances[3 * i + 1] = (bk * x - kx + bu * k - n * bu * bk) / n
+            covariances[3 * i + 2] = alpha + (2 * kk - k - 2 * bk * k + n * bk * bk) / n
         return -1
 
-    return _jit.compiled(match_all, _SIGNATURE)
+    return match_all

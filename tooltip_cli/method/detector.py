@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tooltip_cli.method.affine import fit_background
-from tooltip_cli.method.blocks import match_blocks, matchable
+from tooltip_cli.method.blocks import match_blocks, matchable_points
 from tooltip_cli.method.types import Array, TipPixels
 
 Image = npt.NDArray[np.uint8]
@@ -83,17 +83,15 @@ class Detections:
 
 
 def find_edges(image: Image, params: DetectorParams) -> Edges:
-    """Return (N, 2) Canny edge points (u, v), in row-major order.
+    """Return the (N, 2) Canny edge points (u, v) that can be matched, in row-major order.
 
     Args:
         image: (H, W) gray.
     """
     import cv2
 
-    points = cv2.findNonZero(cv2.Canny(image, params.canny_low, params.canny_high))
-    if points is None:  # OpenCV's word for no edge at all, e.g. in darkness
-        return np.zeros((0, 2), dtype=np.int32)
-    return np.asarray(points, dtype=np.int32).reshape(-1, 2)
+    found = np.asarray(cv2.Canny(image, params.canny_low, params.canny_high), dtype=np.uint8)
+    return matchable_points(found, params.block, params.search)
 
 
 def edge_motion(
@@ -103,10 +101,8 @@ def edge_motion(
 
     Args:
         first: (H, W) gray I_1; ``second``: I_2 of the same shape.
-        edges: (N, 2) edge points of ``first``.
+        edges: (N, 2) edge points of ``first``, see `find_edges`.
     """
-    inside = matchable(edges, first.shape, params.block, params.search)
-    edges = np.ascontiguousarray(edges[inside])
     if len(edges) < params.min_edges:
         return FEW_EDGES
     matches = match_blocks(
