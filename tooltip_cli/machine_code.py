@@ -117,13 +117,13 @@ def _kernel(
     for place in places:
         stored = _read(place)
         if stored is not None:
-            return _prototype(signature)(_link(*stored))
+            return _callable(signature, _link(*stored))
     symbol, code, address = _compile(module, name, signature, constants)
     if code is None:
-        return _prototype(signature)(address)
+        return _callable(signature, address)
     if not any(_written(place, symbol, code) for place in places):
         _LOGGER.info("no folder for compiled kernels is writable; compiling for this run only")
-    return _prototype(signature)(_link(symbol, code))
+    return _callable(signature, _link(symbol, code))
 
 
 def _key(module: str, name: str, signature: str, constants: tuple[int, ...]) -> str:
@@ -228,12 +228,12 @@ def _link(symbol: str, code: bytes) -> int:
     return int(engine.get_function_address(symbol))
 
 
-def _prototype(signature: str) -> Any:
-    arguments = [
+def _callable(signature: str, address: int) -> Callable[..., int]:
+    arguments: list[Any] = [
         _address(np.dtype(_TYPES[kind[:-1]])) if kind.endswith("*") else _SCALARS[kind]
         for kind in signature.split()
     ]
-    return ctypes.CFUNCTYPE(ctypes.c_int64, *arguments)
+    return ctypes.CFUNCTYPE(ctypes.c_int64, *arguments)(address)
 
 
 def _address(kind: np.dtype[Any]) -> Any:

@@ -3,7 +3,9 @@
 The edges are laid out column by column once, so that every later pass over them runs in vector
 instructions: one pass adds up the normal equations of appendix A, one computes the distances and
 their ranks, one counts the ranks. Arrays are addresses here, as in C: what numba calls an array
-counts references and wraps indices around, which costs a third of the time. This module imports numba; `machine_code` imports it where there is something to compile.
+counts references and lets indices wrap around, which keeps loops from becoming vector code.
+
+This module imports numba; `machine_code` imports it where there is something to compile.
 """
 
 from __future__ import annotations
@@ -172,7 +174,7 @@ def _square_distances(
         keys[i] = min(max(key, 0), _BINS - 1)
 
 
-def _keep_best(keys: Any, size: int, keep: int, bins: Any) -> float:
+def _keep_best(keys: Any, size: int, keep: int, bins: Any) -> Any:
     """Return the squared distance up to which `keep` edges or, with their ties, more lie."""
     for key in range(4 * _BINS):
         bins[key] = 0
@@ -230,7 +232,8 @@ def background_fitter() -> Callable[..., int]:
     edges; the (6,) model to rank by first, which is overwritten, unless ``started`` is 0; the
     number of iterations, the fraction to drop, the squared distance below which nothing is dropped,
     the tolerance for singularity; scratch space: (7, N) columns, (N,) keys, (4, bins) counts, 24
-    sums and 42 numbers; and the results to fill: the (6,) model, (N,) distances and (N,) inliers. It returns whether there is a model.
+    sums and 42 numbers; and the results to fill: the (6,) model, (N,) distances and (N,) inliers.
+    It returns whether there is a model.
     """
 
     def fit_edges(

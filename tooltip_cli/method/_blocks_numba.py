@@ -2,7 +2,7 @@
 
 The sums of absolute differences (SADs) of sixteen neighbouring displacements are formed side by
 side in the 16-bit lanes of a vector. Numba's loops are not turned into such code by LLVM, so the
-part that matters is handed to LLVM as vector code (`match_edge`): portable vectors, which become
+part that matters is handed to LLVM as vector code (`_EdgeCode`): portable vectors, which become
 whatever the processor has, and on x86 the instructions ``mpsadbw`` and ``vdbpsadbw``, which form
 the SADs of four pixels at eight (SSE4.1) or sixteen (AVX2, AVX-512) displacements at once.
 
@@ -39,17 +39,18 @@ _BYTE, _LANE, _WORD, _INDEX = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 class _EdgeCode:
     """Writes the vector code that matches one edge.
 
-    Of the block's columns the instructions take four at a time (a quad); the spare ones, which are
-    all of them in portable code, add |a - b| = 2 max(a, b) - a - b, one instruction fewer for every
-    pixel than a difference and its absolute value. Where the last quad lacks a column (blocks of
-    3, 7, 11, 15), zeros fill it, and what they add, the second image's pixels, is subtracted as -b
-    of a spare column.
+    Of the block's columns the instructions take four at a time (a quad). A single column that is
+    left (blocks of 5, 9, 13) adds |a - b|. Where the last quad lacks a column (blocks of 3, 7, 11,
+    15), zeros fill it, and what they add, the second image's pixels, is subtracted as -b of a spare
+    column. In portable code all columns are spare and add |a - b| = 2 max(a, b) - a - b: one
+    instruction fewer for every pixel than a difference and its magnitude.
 
     Attributes:
         lanes: displacements side by side in one vector, of type `vector`.
         pieces: vectors for one row of displacements.
         quads: first columns of the quads.
         spare: spare columns.
+        single: whether one column is left beside the quads.
     """
 
     def __init__(self, builder: Any, block: int, search: int, form: Form) -> None:
@@ -59,6 +60,7 @@ class _EdgeCode:
         self.quads = range(0) if form is Form.PORTABLE else range(0, block - 2, 4)
         taken = 4 * len(self.quads)
         self.spare = range(min(block, taken), max(block, taken))
+        self.single = self.block == taken + 1
         self.vector = ir.VectorType(_LANE, self.lanes)
 
     def at(self, pointer: Any, offset: int) -> Any:
@@ -84,6 +86,9 @@ class _EdgeCode:
 
     def pick(self, extreme: str, left: Any, right: Any) -> Any:
         return self.call(f"llvm.{extreme}.v{self.lanes}i16", self.vector, left, right)
+
+    def magnitude(self, lanes: Any) -> Any:
+        return self.call(f"llvm.abs.v{self.lanes}i16", self.vector, lanes, ir.IntType(1)(0))
 
     def least_lane(self, lanes: Any) -> Any:
         return self.call(f"llvm.vector.reduce.umin.v{self.lanes}i16", _LANE, lanes)
@@ -148,8 +153,14 @@ class _EdgeCode:
                 block_quads, block_spare = block_rows[y - dv]
                 for theirs, ours in zip(quads, block_quads, strict=True):
                     sums[dv] = builder.add(sums[dv], self.quad_sads(theirs, ours))
+                if self.single:
+                    difference = builder.sub(spare[0], block_spare[0])
+                    sums[dv] = builder.add(sums[dv], self.magnitude(difference))
+                    continue
                 for theirs, ours in zip(spare, block_spare, strict=False):
                     maxima[dv] = builder.add(maxima[dv], self.pick("smax", theirs, ours))
+        if self.single:
+            return sums
         totals = [functools.reduce(builder.add, spare) for _, spare in window_rows]
         taken_off = itertools.chain(*(spare for _, spare in block_rows), totals[: self.block - 1])
         below = functools.reduce(builder.add, taken_off)
@@ -161,16 +172,14 @@ class _EdgeCode:
             below = builder.sub(below, totals[dv])
         return sads
 
-    def sad_map(self, block: _Image, window: _Image) -> Any:
-        """Write the SADs of all displacements into a new buffer and return its address.
+    def write_sads(self, block: _Image, window: _Image, sads: Any) -> None:
+        """Write the SADs of all displacements.
 
-        The buffer holds search rows of `pieces` vectors; lanes outside the window hold 0xFFFF.
+        They are search rows of `pieces` vectors; lanes outside the window hold 0xFFFF.
         """
         builder = self.builder
         rows = min(self.search, _BLOCK_ROWS_AT_ONCE // self.block)
         block_rows = [self.block_row(self.row(block, _INDEX(y))) for y in range(self.block)]
-        buffer = cgutils.alloca_once(builder, ir.ArrayType(self.vector, self.search * self.pieces))
-        sads = builder.bitcast(buffer, self.vector.as_pointer())
         with cgutils.for_range(builder, _INDEX(-(-self.search // rows))) as loop:
             # The last rows may overlap the ones before: the same numbers are written again.
             wanted, last = builder.mul(loop.index, _INDEX(rows)), _INDEX(self.search - rows)
@@ -184,8 +193,7 @@ class _EdgeCode:
                 for dv, sad in enumerate(self.sad_rows(block_rows, pixels)):
                     index = builder.mul(builder.add(top, _INDEX(dv)), _INDEX(self.pieces))
                     place = builder.gep(sads, [builder.add(index, _INDEX(piece))])
-                    builder.store(builder.or_(sad, outside), place)
-        return sads
+                    builder.store(builder.or_(sad, outside), place, align=2)
 
     def best(self, rows: list[list[Any]], ranks: Any) -> tuple[Any, Any]:
         """The lowest SAD and the lowest rank of the displacements that have it."""
@@ -209,10 +217,9 @@ class _EdgeCode:
         """
         builder, reach = self.builder, self.search // 2
         threshold = self.splat(highest, self.lanes)
-        wide = ir.VectorType(_WORD, self.lanes)
         x = range(-reach, reach + 1)
         ones, squares = [1] * self.search, [value * value for value in x]
-        sums: list[Any] = [_WORD(0)] * 6
+        parts: list[list[Any]] = [[] for _ in range(6)]
         for piece in range(self.pieces):
             count = once = twice = self.vector([0] * self.lanes)
             for row in rows:
@@ -221,17 +228,56 @@ class _EdgeCode:
                 once = builder.add(once, count)
                 twice = builder.add(twice, once)
             weighted = [(count, ones), (count, x), (count, squares), (once, ones), (once, x)]
-            for index, (lanes, values) in enumerate([*weighted, (twice, ones)]):
-                factors = builder.sext(self.constant(piece, values, 0), wide)
-                product = builder.mul(builder.zext(lanes, wide), factors)
-                total = self.call(f"llvm.vector.reduce.add.v{self.lanes}i32", _WORD, product)
-                sums[index] = builder.add(sums[index], total)
-        return sums
+            for part, (lanes, values) in zip(parts, [*weighted, (twice, ones)], strict=True):
+                part.append(self.weigh(lanes, self.constant(piece, values, 0)))
+        return self.totals([functools.reduce(builder.add, part) for part in parts])
 
-    def match(self, block: _Image, window: _Image, ranks: Any, excess: Any) -> list[Any]:
-        """The eight numbers that `match_edge` returns."""
+    @property
+    def signed(self) -> bool:
+        """Whether all running totals fit 15 bits, as x86's multiplication of lanes wants them."""
+        return self.form is not Form.PORTABLE and self.search <= 55
+
+    def weigh(self, lanes: Any, factors: Any) -> Any:
+        """Products of lanes and constants as 32-bit lanes, neighbours added up where that is one
+        instruction."""
+        if self.signed:
+            half = ir.VectorType(_WORD, self.lanes // 2)
+            name = "llvm.x86.avx2.pmadd.wd" if self.lanes == 16 else "llvm.x86.sse2.pmadd.wd"
+            return self.call(name, half, lanes, factors)
+        wide = ir.VectorType(_WORD, self.lanes)
+        return self.builder.mul(self.builder.zext(lanes, wide), self.builder.sext(factors, wide))
+
+    def totals(self, vectors: list[Any]) -> list[Any]:
+        """The sums over the lanes of six vectors of 32-bit lanes."""
         builder = self.builder
-        sads = self.sad_map(block, window)
+        if not self.signed:
+            name = f"llvm.vector.reduce.add.v{self.lanes}i32"
+            return [self.call(name, _WORD, vector) for vector in vectors]
+        quarter = ir.VectorType(_WORD, 4)
+        if self.lanes == 16:
+            lower, upper = quarter(list(range(4))), quarter(list(range(4, 8)))
+            vectors = [
+                builder.add(
+                    builder.shuffle_vector(vector, vector, lower),
+                    builder.shuffle_vector(vector, vector, upper),
+                )
+                for vector in vectors
+            ]
+
+        def neighbours(left: Any, right: Any) -> Any:
+            return self.call("llvm.x86.ssse3.phadd.d.128", quarter, left, right)
+
+        a, b, c, d, e, f = vectors
+        four, two = neighbours(neighbours(a, b), neighbours(c, d)), neighbours(e, f)
+        two = neighbours(two, two)
+        return [
+            *(builder.extract_element(four, _WORD(lane)) for lane in range(4)),
+            *(builder.extract_element(two, _WORD(lane)) for lane in range(2)),
+        ]
+
+    def summary(self, sads: Any, ranks: Any, excess: Any) -> list[Any]:
+        """The eight numbers that `summarize` returns."""
+        builder = self.builder
         rows = [
             [self.load(self.at(sads, y * self.pieces + p), self.vector) for p in range(self.pieces)]
             for y in range(self.search)
@@ -243,8 +289,17 @@ class _EdgeCode:
         sums = [builder.sext(total, _INDEX) for total in self.moments(rows, highest)]
         return [builder.zext(least, _INDEX), builder.zext(rank, _INDEX), *sums]
 
+    def slot(self, sads: Any, index: Any) -> Any:
+        """The address of one edge's SADs among those of several."""
+        rows = self.builder.bitcast(sads, self.vector.as_pointer())
+        offset = self.builder.mul(index, _INDEX(self.search * self.pieces))
+        return self.builder.gep(rows, [offset])
 
-def _match_edge(
+
+_PIXELS, _LANES = types.CPointer(types.uint8), types.CPointer(types.uint16)
+
+
+def _compare(
     _typing: Any,
     first: Any,
     block_at: Any,
@@ -252,13 +307,13 @@ def _match_edge(
     second: Any,
     window_at: Any,
     second_stride: Any,
-    ranks: Any,
-    excess: Any,
+    sads: Any,
+    slot: Any,
     block: Any,
     search: Any,
     form: Any,
 ) -> Any:
-    """Match one edge, in numba code.
+    """Write the SADs of one edge at all displacements, in numba code.
 
     Args:
         first: the first image, by its address.
@@ -267,6 +322,40 @@ def _match_edge(
         second: the second image, or the scratch copy of the window, likewise.
         window_at: where in it the search window's top left pixel is.
         second_stride: bytes from one row of it to the next.
+        sads: space for the SADs of several edges, by its address.
+        slot: which of them this edge is.
+        block, search, form: the constants of `matcher`.
+    """
+    sides = block.literal_value, search.literal_value
+    kind = Form(form.literal_value)
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        code = _EdgeCode(builder, *sides, kind)
+        block_image = (builder.gep(values[0], [values[1]]), values[2])
+        window_image = (builder.gep(values[3], [values[4]]), values[5])
+        code.write_sads(block_image, window_image, code.slot(values[6], values[7]))
+        return context.get_dummy_value()
+
+    image = [_PIXELS, types.int64, types.int64]
+    signature = types.void(*image, *image, _LANES, types.int64, block, search, form)
+    return signature, generate
+
+
+def _summarize(
+    _typing: Any,
+    sads: Any,
+    slot: Any,
+    ranks: Any,
+    excess: Any,
+    block: Any,
+    search: Any,
+    form: Any,
+) -> Any:
+    """Find the best of the SADs that `compare` wrote, and who is similar, in numba code.
+
+    Args:
+        sads: the SADs of several edges, by their address.
+        slot: which of them.
         ranks: a `blocks.rank_table`, by its address.
         excess: how much a SAD may exceed the lowest one and still count as similar.
         block, search, form: the constants of `matcher`.
@@ -274,40 +363,44 @@ def _match_edge(
     Returns:
         The lowest SAD, its rank, and the six sums of `_EdgeCode.moments`.
     """
-    constants = [constant.literal_value for constant in (block, search, form)]
+    sides = block.literal_value, search.literal_value
+    kind = Form(form.literal_value)
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        code = _EdgeCode(builder, *constants[:2], Form(constants[2]))
-        block_image = (builder.gep(values[0], [values[1]]), values[2])
-        window_image = (builder.gep(values[3], [values[4]]), values[5])
-        ranks_at = builder.bitcast(values[6], _BYTE.as_pointer())
-        numbers = code.match(block_image, window_image, ranks_at, values[7])
+        code = _EdgeCode(builder, *sides, kind)
+        ranks_at = builder.bitcast(values[2], _BYTE.as_pointer())
+        numbers = code.summary(code.slot(values[0], values[1]), ranks_at, values[3])
         return context.make_tuple(builder, signature.return_type, numbers)
 
-    pixels, ranks = types.CPointer(types.uint8), types.CPointer(types.uint16)
-    image = [pixels, types.int64, types.int64]
-    constant_types = [block, search, form]
-    signature = types.UniTuple(types.int64, 8)(*image, *image, ranks, types.int64, *constant_types)
+    signature = types.UniTuple(types.int64, 8)(
+        _LANES, types.int64, _LANES, types.int64, block, search, form
+    )
     return signature, generate
 
 
-match_edge = intrinsic(prefer_literal=True)(_match_edge)
+compare = intrinsic(prefer_literal=True)(_compare)
+summarize = intrinsic(prefer_literal=True)(_summarize)
 
 
-def matcher(block: int, search: int, form: int) -> Callable[..., int]:
+def matcher(block: int, search: int, form: int, slots: int) -> Callable[..., int]:
     """Return the loop over the edges for one size of block and search window, to be compiled.
 
     Its arguments are what `blocks._match_compiled` gives: the two images and their size; N edges
-    and, unless ``moved`` is 0, as many offsets, all as u, v; the excess of `match_edge`; alpha; the
-    displacements in the order in which ties are decided, and their `blocks.rank_table`; how many
-    bytes `match_edge` may read from the start of a window's row, and scratch space for a window of
-    such rows; and the results to fill. It returns the index of the first edge whose block or window
+    and, unless ``moved`` is 0, as many offsets, all as u, v; how much a SAD may exceed the lowest
+    one and still count as similar; alpha; the displacements in the order in which ties are decided,
+    and their `blocks.rank_table`; how many bytes `compare` may read from the start of a window's
+    row, and scratch space for a window of such rows; space for the SADs of ``slots`` edges; and the
+    results to fill. It returns the index of the first edge whose block or window
     leaves the image, or -1.
+
+    Some edges are compared first and summarized afterwards: what depends on what within an edge
+    then waits less, because the processor works on several at a time.
 
     Args:
         block: side of the blocks, pixels; odd, 3 to 15.
         search: side of the search window, pixels; odd, 3 to 71.
         form: the `blocks.Form` of the code.
+        slots: edges that are compared before they are summarized.
     """
     half, margin = block // 2, block // 2 + search // 2
     side = 2 * margin + 1
@@ -327,48 +420,48 @@ def matcher(block: int, search: int, form: int) -> Callable[..., int]:
         ranks: Any,
         reach: int,
         scratch: Any,
+        sads: Any,
         translations: Any,
         sad: Any,
         covariances: Any,
     ) -> int:
-        for i in range(count):
-            u, v = np.int64(edges[2 * i]), np.int64(edges[2 * i + 1])
-            if u < half or v < half or u >= width - half or v >= height - half:
-                return i
-            du, dv = np.int64(0), np.int64(0)
-            if moved > 0:
-                du, dv = np.int64(offsets[2 * i]), np.int64(offsets[2 * i + 1])
-            left, top = u + du - margin, v + dv - margin
-            if left < 0 or top < 0 or left + side > width or top + side > height:
-                return i
-            image, window, stride = second, top * width + left, width
-            if (top + side - 1) * width + left + reach > height * width:
-                # Vectors read beyond the window's last column; here that would leave the image.
-                for y in range(side):
-                    for x in range(side):
-                        scratch[y * reach + x] = second[(top + y) * width + left + x]
-                image, window, stride = scratch, np.int64(0), reach
-            least, rank, n, x, xx, k, kx, kk = match_edge(
-                first,
-                (v - half) * width + u - half,
-                width,
-                image,
-                window,
-                stride,
-                ranks,
-                excess,
-                block,
-                search,
-                form,
-            )
-            bu, bv = np.int64(displacements[2 * rank]), np.int64(displacements[2 * rank + 1])
-            translations[2 * i], translations[2 * i + 1] = du + bu, dv + bv
-            sad[i] = least
-            # Scatter around the best match, in integers until the division; bk is its row's k.
-            bk = search - search // 2 - bv
-            covariances[3 * i] = alpha + (xx - 2 * bu * x + n * bu * bu) / n
-            covariances[3 * i + 1] = (bk * x - kx + bu * k - n * bu * bk) / n
-            covariances[3 * i + 2] = alpha + (2 * kk - k - 2 * bk * k + n * bk * bk) / n
+        for start in range(0, count, slots):
+            stop = min(start + slots, count)
+            for i in range(start, stop):
+                u, v = np.int64(edges[2 * i]), np.int64(edges[2 * i + 1])
+                if u < half or v < half or u >= width - half or v >= height - half:
+                    return i
+                left, top = u - margin, v - margin
+                if moved > 0:
+                    left, top = left + offsets[2 * i], top + offsets[2 * i + 1]
+                if left < 0 or top < 0 or left + side > width or top + side > height:
+                    return i
+                image, window, stride = second, top * width + left, width
+                if (top + side - 1) * width + left + reach > height * width:
+                    # Vectors read beyond the window's last column; here that leaves the image.
+                    for y in range(side):
+                        for x in range(side):
+                            scratch[y * reach + x] = second[(top + y) * width + left + x]
+                    image, window, stride = scratch, np.int64(0), reach
+                block_at, slot = (v - half) * width + u - half, i - start
+                compare(
+                    first, block_at, width, image, window, stride, sads, slot, block, search, form
+                )
+            for i in range(start, stop):
+                least, rank, n, x, xx, k, kx, kk = summarize(
+                    sads, i - start, ranks, excess, block, search, form
+                )
+                bu, bv = np.int64(displacements[2 * rank]), np.int64(displacements[2 * rank + 1])
+                translations[2 * i], translations[2 * i + 1] = bu, bv
+                if moved > 0:
+                    translations[2 * i] += offsets[2 * i]
+                    translations[2 * i + 1] += offsets[2 * i + 1]
+                sad[i] = least
+                # Scatter around the best match, in integers until the division; bk: its row's k.
+                bk = search - search // 2 - bv
+                covariances[3 * i] = alpha + (xx - 2 * bu * x + n * bu * bu) / n
+                covariances[3 * i + 1] = (bk * x - kx + bu * k - n * bu * bk) / n
+                covariances[3 * i + 2] = alpha + (2 * kk - k - 2 * bk * k + n * bk * bk) / n
         return -1
 
     return match_all

@@ -25,6 +25,6 @@ def point_lister() -> Callable[..., int]:
                 # written always and counted if it is one: no branch to guess, a third of the time
                 points[2 * count], points[2 * count + 1] = u, v
                 count += mask[v * width + u] != 0
-        return count
+        return int(count)
 
     return list_points

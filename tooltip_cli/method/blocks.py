@@ -21,10 +21,11 @@ MAX_BLOCK = 15
 MAX_SEARCH = 71
 
 _ARGUMENTS = (  # of `_blocks_numba.matcher`
-    "u8* u8* i64 i64 i32* i64 i32* i64 i64 f64 i32* u16* i64 u8* i32* i32* f64*"
+    "u8* u8* i64 i64 i32* i64 i32* i64 i64 f64 i32* u16* i64 u8* u16* i32* i32* f64*"
 )
 _NO_OFFSETS: Pixels = np.empty((0, 2), np.int32)
 _KERNELS = "tooltip_cli.method._blocks_numba"
+_SLOTS = 8  # edges that the compiled form compares before it looks at what came out
 _EDGES_AT_ONCE = 256  # bounds the temporaries of the numpy form to a few megabytes
 
 
@@ -183,13 +184,14 @@ def _match_compiled(
     form: Form | None = None,
 ) -> BlockMatches:
     form = best_form() if form is None else form
-    constants = (block, search, int(form))
+    constants = (block, search, int(form), _SLOTS)
     match = machine_code.kernel(_KERNELS, "matcher", _ARGUMENTS, *constants)
     matches = BlockMatches(
         translations=np.empty((len(edges), 2), np.int32),
         sad=np.empty(len(edges), np.int32),
         covariances=np.empty((len(edges), 3)),
     )
+    ranks = rank_table(search, form)
     reach = search + block + 32  # what the compiled form may read from the start of a window's row
     outside = match(
         first,
@@ -202,9 +204,10 @@ def _match_compiled(
         excess,
         alpha,
         _displacements(search),
-        rank_table(search, form),
+        ranks,
         reach,
         np.zeros((search + block - 1, reach), np.uint8),
+        _at_cache_line(_SLOTS * ranks.size),
         matches.translations,
         matches.sad,
         matches.covariances,
@@ -318,6 +321,12 @@ def rank_table(search: int, form: Form) -> npt.NDArray[np.uint16]:
     table[row, column] = np.arange(len(displacements))
     table.flags.writeable = False
     return table
+
+
+def _at_cache_line(count: int) -> npt.NDArray[np.uint16]:
+    """Return space for so many numbers that starts at a cache line: vectors then lie in one."""
+    space = np.empty(count + 32, np.uint16)
+    return space[-space.ctypes.data % 64 // 2 :][:count]
 
 
 def _images(first: Bytes, second: Bytes) -> tuple[Bytes, Bytes]:

@@ -10,17 +10,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-DIS = {
-    "dis-ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
-    "dis-fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
-    "dis-medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
-}
+DIS = {"dis-ultrafast": 0, "dis-fast": 1, "dis-medium": 2}  # OpenCV's presets
 
 
 def main() -> None:
@@ -29,7 +26,8 @@ def main() -> None:
     parser.add_argument("--flow", choices=sorted(DIS))
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    flow = cv2.DISOpticalFlow_create(DIS[options.flow]) if options.flow else None
+    library: Any = cv2  # its type stubs lack the flows
+    flow = library.DISOpticalFlow_create(DIS[options.flow]) if options.flow else None
     last = None
     with options.recording.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
