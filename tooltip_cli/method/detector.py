@@ -142,6 +142,6 @@ def detect_tip(first: Image, second: Image, edges: Edges, params: DetectorParams
         weight,
         motion.affine,
         len(motion.edges),
-        int(motion.background.sum()),
+        int(np.count_nonzero(motion.background)),
         () if moving else (NO_MOTION,),
     )
