@@ -67,7 +67,7 @@ def fast_or_slow(
 @functools.cache
 def _say_slow(obstacle: str) -> None:
     _LOGGER.warning(
-        "%s: the detector falls back to plain numpy, which gives the same answers about a "
+        "%s: detection falls back to plain numpy, which gives the same answers about a "
         "hundred times slower",
         obstacle,
     )
