@@ -48,7 +48,7 @@ def test_closest_points_equal_a_least_squares_solution(
     assert np.allclose([a1, a2], found, atol=1e-8)
 
 
-@settings(max_examples=200)
+@settings(max_examples=200, deadline=None)
 @given(o1=points, d1=units, o2=points, d2=units)
 def test_the_midpoint_is_nearest_to_both_rays(o1: Array, d1: Array, o2: Array, d2: Array) -> None:
     """The point with the least sum of squared distances to two lines, by its normal equations."""

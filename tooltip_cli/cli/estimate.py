@@ -16,10 +16,12 @@ from tooltip_cli.cli.options import (
     json_option,
     out_option,
     print_json,
+    profile_option,
     progress,
     recordings_argument,
     rig_option,
     say,
+    say_profile,
     topic_options,
 )
 
@@ -42,6 +44,7 @@ from tooltip_cli.cli.options import (
     help="Estimate from these hand labels instead of detections (the paper's baseline).",
 )
 @jobs_option
+@profile_option
 @out_option
 @topic_options
 @force_option
@@ -54,6 +57,7 @@ def estimate(
     method: str,
     from_labels: Path | None,
     jobs: int,
+    profile: bool,
     out: Path | None,
     image: str | None,
     joints: str | None,
@@ -76,13 +80,17 @@ def estimate(
     """
     from tooltip_cli.log.recording import Topics
     from tooltip_cli.method.estimators import EstimatorParams
+    from tooltip_cli.stages.clock import measuring
     from tooltip_cli.stages.estimate import estimate as run
 
     documents: list[dict[str, Any]] = []
     refusals = 0
     check_names(recordings, out)
     for path in recordings:
-        with progress(None, f"detect {path.name}, pairs") as advance:
+        with (
+            measuring(profile) as stopwatch,
+            progress(None, f"detect {path.name}, pairs") as advance,
+        ):
             found = run(
                 path,
                 rig=rig,
@@ -94,6 +102,7 @@ def estimate(
                 jobs=jobs,
                 on_pair=advance,
             )
+        say_profile(str(path), stopwatch)
         for note in found.notes:
             say(f"{path}: {note}")
         if found.detected is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,14 +95,23 @@ def find_edges(image: Image, params: DetectorParams) -> Edges:
     return matchable_points(found, params.block, params.search)
 
 
+def _not_asked(step: str) -> None:
+    """Nobody wants to know that a step has ended."""
+
+
 def edge_motion(
-    first: Image, second: Image, edges: Edges, params: DetectorParams
+    first: Image,
+    second: Image,
+    edges: Edges,
+    params: DetectorParams,
+    lap: Callable[[str], None] = _not_asked,
 ) -> EdgeMotion | str:
     """Return the weighted edge map, or the flag that says why there is none.
 
     Args:
         first: (H, W) gray I_1; ``second``: I_2 of the same shape.
         edges: (N, 2) edge points of ``first``, see `find_edges`.
+        lap: told the name of each step when it ends: ``match``, ``fit``.
     """
     if len(edges) < params.min_edges:
         return FEW_EDGES
@@ -114,6 +124,7 @@ def edge_motion(
         tau=params.tau,
         alpha=params.alpha,
     )
+    lap("match")
     fit = fit_background(
         edges,
         matches.translations,
@@ -121,6 +132,7 @@ def edge_motion(
         iterations=params.drop_iterations,
         drop_fraction=params.drop_fraction,
     )
+    lap("fit")
     if fit is None:
         return SINGULAR
     return EdgeMotion(
@@ -128,9 +140,18 @@ def edge_motion(
     )
 
 
-def detect_tip(first: Image, second: Image, edges: Edges, params: DetectorParams) -> TipDetection:
-    """Select the heaviest edge of a pair of images; the first in row-major order of equals."""
-    motion = edge_motion(first, second, edges, params)
+def detect_tip(
+    first: Image,
+    second: Image,
+    edges: Edges,
+    params: DetectorParams,
+    lap: Callable[[str], None] = _not_asked,
+) -> TipDetection:
+    """Select the heaviest edge of a pair of images; the first in row-major order of equals.
+
+    Args are those of `edge_motion`.
+    """
+    motion = edge_motion(first, second, edges, params, lap)
     if isinstance(motion, str):
         nothing = np.full(2, np.nan)
         return TipDetection(nothing, 0.0, np.full((2, 3), np.nan), len(edges), 0, (motion,))
