@@ -21,7 +21,7 @@ from tooltip_cli.method.blocks import (
     Form,
     match_blocks,
     matchable,
-    matchable_points,
+    window_margin,
 )
 
 Image = npt.NDArray[np.uint8]
@@ -386,16 +386,14 @@ def test_vectors_do_not_read_beyond_the_images(block: int, search: int, form: Fo
         assert_same(found, match_blocks(first, second, edges, **options))
 
 
-@pytest.mark.parametrize("shape", [(480, 640), (14, 90), (15, 15), (3, 40), (0, 0)])
-def test_listed_points_are_the_matchable_ones(shape: tuple[int, int]) -> None:
-    mask = (np.random.default_rng(0).random(shape) < 0.2).astype(np.uint8) * 255
-    v, u = np.nonzero(mask)
-    everywhere = np.stack([u, v], axis=1)
-    expected = everywhere[matchable(everywhere, shape)]
-    for use_numba in (False, True) if BEST >= 0 else (False,):
-        points = matchable_points(mask, use_numba=use_numba)
-        np.testing.assert_array_equal(points, expected)
-        assert points.dtype == np.int32
+def test_the_margin_is_that_of_the_matchable_edges() -> None:
+    u, v = np.meshgrid(np.arange(40), np.arange(30))
+    edges = np.stack([u.ravel(), v.ravel()], axis=1)
+    for block, search in ((5, 11), (3, 7), (9, 3)):
+        margin = window_margin(block, search)
+        inside = edges[matchable(edges, (30, 40), block, search)]
+        assert inside.min(axis=0).tolist() == [margin, margin]
+        assert inside.max(axis=0).tolist() == [39 - margin, 29 - margin]
 
 
 @needs_numba

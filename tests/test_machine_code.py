@@ -15,7 +15,8 @@ import pytest
 
 from tooltip_cli import machine_code
 from tooltip_cli.method.affine import fit_background
-from tooltip_cli.method.blocks import match_blocks, matchable_points
+from tooltip_cli.method.blocks import match_blocks
+from tooltip_cli.method.canny import edge_points
 
 pytest.importorskip("numba")
 
@@ -25,11 +26,12 @@ EVERY_KERNEL = """
 import sys
 import numpy as np
 from tooltip_cli.method.affine import fit_background
-from tooltip_cli.method.blocks import match_blocks, matchable_points
+from tooltip_cli.method.blocks import match_blocks
+from tooltip_cli.method.canny import edge_points
 
 rng = np.random.default_rng(0)
 first, second = rng.integers(0, 256, (2, 60, 80), np.uint8)
-points = matchable_points((first > 200).view(np.uint8))
+points = edge_points(first, 300, 700, 7)
 matches = match_blocks(first, second, points)
 fit = fit_background(points, matches.translations, matches.covariances)
 again = fit_background(points.astype(float), matches.translations, matches.covariances)
@@ -57,7 +59,7 @@ def test_later_processes_need_no_numba_and_mend_what_is_damaged(tmp_path: Path) 
     assert run(tmp_path) == (first, False)
     kept = sorted(tmp_path.glob("*.o"))
     assert len(kept) == 4
-    (points,) = (file for file in kept if "point_lister" in file.name)
+    (points,) = (file for file in kept if "edge_finder" in file.name)
     whole = points.read_bytes()
     for damaged in (whole[:-100], whole[:-1] + bytes([whole[-1] ^ 1]), b""):
         points.write_bytes(damaged)
@@ -131,7 +133,7 @@ def test_slow_numpy_is_announced_once(
 ) -> None:
     if without == "import":
         monkeypatch.setitem(sys.modules, "numba", None)
-        for kernels in ("_blocks_numba", "_affine_numba", "_points_numba"):
+        for kernels in ("_blocks_numba", "_affine_numba", "_canny_numba"):
             monkeypatch.delitem(sys.modules, f"tooltip_cli.method.{kernels}", raising=False)
     else:
         monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
@@ -139,7 +141,7 @@ def test_slow_numpy_is_announced_once(
     rng = np.random.default_rng(0)
     first, second = rng.integers(0, 256, (2, 40, 40), np.uint8)
     with caplog.at_level(logging.WARNING):
-        points = matchable_points((first > 230).view(np.uint8))
+        points = edge_points(first, 300, 700, 7)
         for _ in range(2):
             found = match_blocks(first, second, points)
         fit_background(points, found.translations, found.covariances)

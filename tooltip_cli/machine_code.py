@@ -31,7 +31,14 @@ _LOCK = threading.Lock()  # one thread compiles or links, the others wait for wh
 _ENGINES: list[Any] = []  # linked code lives as long as its engine
 
 # spelling -> name of numpy's, numba's and ctypes' type
-_TYPES = {"u8": "uint8", "u16": "uint16", "i32": "int32", "i64": "int64", "f64": "float64"}
+_TYPES = {
+    "u8": "uint8",
+    "u16": "uint16",
+    "i32": "int32",
+    "i64": "int64",
+    "f32": "float32",
+    "f64": "float64",
+}
 _SCALARS = {"i64": ctypes.c_int64, "f64": ctypes.c_double}
 
 # What a kernel must not call: symbols that exist only where numba has been imported.

@@ -84,43 +84,9 @@ def matchable(
     return _inside(edges, shape, half) & _inside(centres, shape, half + search // 2)
 
 
-def matchable_points(
-    mask: Bytes, block: int = 5, search: int = 11, use_numba: bool | None = None
-) -> Pixels:
-    """List the points of an edge image that can be matched, see `matchable`, row by row.
-
-    Args:
-        mask: (H, W) uint8, not zero at the edges.
-        block: side of the blocks, pixels.
-        search: side of the search window, pixels.
-        use_numba: whether to run the compiled form, see `match_blocks`.
-
-    Returns:
-        (N, 2) int32, u, v of the edges, pixels.
-
-    Raises:
-        ImportError: `use_numba` is True and numba cannot be imported.
-    """
-    mask = np.ascontiguousarray(mask)
-    margin = block // 2 + search // 2
-    return machine_code.fast_or_slow(
-        lambda: _points_compiled(mask, margin), lambda: _points_numpy(mask, margin), use_numba
-    )
-
-
-def _points_compiled(mask: Bytes, margin: int) -> Pixels:
-    listed = machine_code.kernel(
-        "tooltip_cli.method._points_numba", "point_lister", "u8* i64 i64 i64 i32*"
-    )
-    inside = [max(side - 2 * margin, 0) for side in mask.shape]
-    points = np.empty((inside[0] * inside[1] + 1, 2), np.int32)  # one is written beyond the last
-    return points[: listed(mask, *mask.shape, margin, points)]
-
-
-def _points_numpy(mask: Bytes, margin: int) -> Pixels:
-    v, u = np.nonzero(mask)
-    points = np.stack([u, v], axis=1).astype(np.int32)
-    return points[_inside(points, mask.shape, margin)]
+def window_margin(block: int, search: int) -> int:
+    """Return how far from the border an edge must be for its block and window to be in view."""
+    return block // 2 + search // 2
 
 
 def match_blocks(

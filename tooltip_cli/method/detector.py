@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tooltip_cli.method.affine import fit_background
-from tooltip_cli.method.blocks import match_blocks, matchable_points
+from tooltip_cli.method.blocks import match_blocks, window_margin
+from tooltip_cli.method.canny import edge_points
 from tooltip_cli.method.types import Array, TipPixels
 
 Image = npt.NDArray[np.uint8]
@@ -89,10 +90,8 @@ def find_edges(image: Image, params: DetectorParams) -> Edges:
     Args:
         image: (H, W) gray.
     """
-    import cv2
-
-    found = np.asarray(cv2.Canny(image, params.canny_low, params.canny_high), dtype=np.uint8)
-    return matchable_points(found, params.block, params.search)
+    margin = window_margin(params.block, params.search)
+    return edge_points(image, params.canny_low, params.canny_high, margin)
 
 
 def _not_asked(step: str) -> None:
