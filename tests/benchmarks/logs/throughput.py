@@ -51,7 +51,7 @@ def recording(frames: int) -> list[Message]:
         )
     for step in range(frames * JOINT_RATE // FRAME_RATE):
         stamp_ns = step * 10**9 // JOINT_RATE
-        payload = messages.joint_state(stamp_ns, JOINTS, rng.uniform(-1, 1, len(JOINTS)))
+        payload = messages.joint_state(stamp_ns, JOINTS, rng.uniform(-1, 1, len(JOINTS)).tolist())
         found.append(Message("/joint_states", messages.JOINT_STATE, stamp_ns, payload))
     return sorted(found, key=lambda message: message.log_time_ns)
 
