@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -30,3 +32,19 @@ def reference_data() -> Path:
     if not REFERENCE.is_dir():
         pytest.skip(f"the reference data is not at {REFERENCE}")
     return REFERENCE
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Yield a headless Chromium: Debian's, or the one that playwright installs."""
+    api = pytest.importorskip("playwright.sync_api", reason="needs: pip install playwright")
+    with api.sync_playwright() as playwright:
+        try:
+            opened = playwright.chromium.launch(
+                executable_path=shutil.which("chromium"),
+                args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"],
+            )
+        except api.Error as error:
+            pytest.skip(f"needs a Chromium, e.g. apt-get install chromium ({error})")
+        yield opened
+        opened.close()

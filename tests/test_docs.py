@@ -103,9 +103,8 @@ def parse(words: list[str]) -> None:
     context = click.Context(main, help_option_names=["-h", "--help"])
     command: click.Command = main
     while isinstance(command, click.Group):
-        name = words.pop(0)
-        found = command.get_command(context, name)
-        assert found is not None, f"no command {name}"
+        _, found, words = command.resolve_command(context, words)
+        assert found is not None
         command = found
     command.make_context(command.name, words, parent=context)
 

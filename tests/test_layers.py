@@ -42,7 +42,9 @@ HEAVY = (
     "rosbags",
     "scipy",
     "skimage",
+    "starlette",
     "trimesh",
+    "uvicorn",
 )
 
 
@@ -220,7 +222,7 @@ def test_help_answers_without_loading_anything_heavy(arguments: list[str]) -> No
     assert not loaded_by(code) & {*HEAVY, "mcap", "yaml"}
 
 
-@pytest.mark.parametrize("command", ["detect", "estimate", "evaluate", "record"])
+@pytest.mark.parametrize("command", ["detect", "estimate", "evaluate", "label", "record"])
 def test_help_of_a_command_loads_nothing_heavy(command: str) -> None:
     code = (
         "from tooltip_cli.cli.main import main\n"

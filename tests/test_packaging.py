@@ -59,6 +59,7 @@ def test_the_wheel_holds_the_code_and_every_data_file(wheel: Path) -> None:
     assert wanted <= names
     code = {str(path.relative_to(ROOT)) for path in (ROOT / "tooltip_cli").rglob("*.py")}
     assert code <= names
+    assert data_files("tooltip_cli/labels/page") <= names
 
 
 def test_the_wheel_holds_nothing_else(wheel: Path) -> None:

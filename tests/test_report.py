@@ -580,22 +580,6 @@ def test_totals_do_not_grow_with_the_recordings(report: EvaluationReport, folder
 # In a browser.
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Yield a headless Chromium: Debian's, or the one that playwright installs."""
-    api = pytest.importorskip("playwright.sync_api", reason="needs: pip install playwright")
-    with api.sync_playwright() as playwright:
-        try:
-            opened = playwright.chromium.launch(
-                executable_path=shutil.which("chromium"),
-                args=["--no-sandbox", "--disable-gpu", "--disable-background-networking"],
-            )
-        except api.Error as error:
-            pytest.skip(f"needs a Chromium, e.g. apt-get install chromium ({error})")
-        yield opened
-        opened.close()
-
-
 @pytest.fixture(params=[(1280, "light"), (400, "dark")], ids=["desk", "phone"])
 def shown(browser: Any, folder: Path, request: pytest.FixtureRequest) -> Iterator[Any]:
     """Yield the page in a browser; what it complains about fails the test."""

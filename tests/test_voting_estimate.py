@@ -166,6 +166,18 @@ def test_two_ends_are_told_and_the_farther_is_given() -> None:
     assert millimetres in reason.text
 
 
+def test_of_two_ends_the_preferred_one_is_given() -> None:
+    second = np.array([-0.08, 0.06, 0.11])
+    both = estimate_by_voting(view(TIP, second), SPHERES, SETTINGS)
+    assert len(both.candidates) == 2
+    for candidate in both.candidates:
+        towards = replace(SETTINGS, prefer=tuple(candidate.position))
+        found = estimate_by_voting(view(TIP, second), SPHERES, towards)
+        np.testing.assert_array_equal(found.position, candidate.position)
+        assert len(found.candidates) == 1
+        assert found.reasons == ()
+
+
 def test_a_tip_outside_the_image_is_refused() -> None:
     edges = view(TIP)
     poses = edges.camera_from_hand[edges.moving.frames]

@@ -15,9 +15,11 @@ from tooltip_cli.cli.options import (
     jobs_option,
     json_option,
     out_option,
+    prefer_option,
     print_json,
     progress,
     recordings_argument,
+    refinement_sentence,
     rig_option,
     say,
     topic_options,
@@ -41,6 +43,13 @@ from tooltip_cli.cli.options import (
     metavar="CSV",
     help="Estimate from these hand labels instead of detections (the paper's baseline).",
 )
+@click.option(
+    "--refine",
+    type=click.Choice(("time", "all")),
+    help="Find the offset of the image clock (time), and where the camera really is (all), from "
+    "the same images, and use what clearly helps. 'tooltip calibrate' writes it as a rig file.",
+)
+@prefer_option
 @jobs_option
 @out_option
 @topic_options
@@ -52,7 +61,9 @@ def estimate(
     recordings: tuple[Path, ...],
     rig: Path | None,
     method: str,
+    prefer: tuple[float, float, float] | None,
     from_labels: Path | None,
+    refine: str | None,
     jobs: int,
     out: Path | None,
     image: str | None,
@@ -76,8 +87,11 @@ def estimate(
     """
     from tooltip_cli.log.recording import Topics
     from tooltip_cli.method.estimators import EstimatorParams
+    from tooltip_cli.method.voting.params import VotingSettings
     from tooltip_cli.stages.estimate import estimate as run
 
+    if refine is not None and (method != "voting" or from_labels is not None):
+        raise click.UsageError("--refine works from images with --method voting alone")
     documents: list[dict[str, Any]] = []
     refusals = 0
     check_names(recordings, out)
@@ -87,8 +101,9 @@ def estimate(
                 path,
                 rig=rig,
                 topics=Topics(image=image, joints=joints, info=info, pose=pose),
-                params=EstimatorParams(method=method),
+                params=EstimatorParams(method=method, voting=VotingSettings(prefer=prefer)),
                 from_labels=from_labels,
+                refine=refine,
                 out=out,
                 force=force,
                 jobs=jobs,
@@ -102,6 +117,8 @@ def estimate(
         say(f"{path}: {'reused' if found.reused else 'computed'} {found.path}")
         for reason in found.estimate.reasons:
             say(f"{path}: {found.estimate.status}: {reason.code}: {reason.text}")
+        if found.estimate.refinement is not None:
+            say(f"{path}: {refinement_sentence(found.document['refined'])}")
         refusals += found.estimate.position is None
         documents.append(found.document)
         if not as_json:

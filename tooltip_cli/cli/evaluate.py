@@ -14,6 +14,7 @@ from tooltip_cli.cli.options import (
     force_option,
     jobs_option,
     json_option,
+    prefer_option,
     print_json,
     progress,
     recordings_argument,
@@ -56,6 +57,7 @@ EXIT_CODES = {"ok": 0, "refused": 3, "failed": 1}
     show_default=True,
     help="Estimator, as in 'tooltip estimate'.",
 )
+@prefer_option
 @click.option(
     "--train", type=click.IntRange(min=1), default=400, show_default=True, help="Training frames."
 )
@@ -105,6 +107,7 @@ def evaluate(
     second_labels: Path | None,
     rig: Path | None,
     method: str,
+    prefer: tuple[float, float, float] | None,
     train: int,
     test: int,
     seed: int,
@@ -138,6 +141,7 @@ def evaluate(
     """
     from tooltip_cli.log.recording import Topics
     from tooltip_cli.method.estimators import EstimatorParams
+    from tooltip_cli.method.voting.params import VotingSettings
     from tooltip_cli.stages.artifacts import plain
     from tooltip_cli.stages.evaluate import evaluate as run
 
@@ -152,7 +156,7 @@ def evaluate(
             test=test,
             seed=seed,
             split=split,
-            params=EstimatorParams(method=method),
+            params=EstimatorParams(method=method, voting=VotingSettings(prefer=prefer)),
             curve=curve,
             frame=frame,
             out=out,

@@ -27,6 +27,12 @@ if TYPE_CHECKING:
 @click.argument("recording", type=PATH, metavar="REC")
 @click.argument("target", type=PATH, metavar="[OUT.mcap]", required=False)
 @click.option("--urdf", type=PATH, metavar="FILE", help="Write the robot with a tool_tip link.")
+@click.option(
+    "--cloud",
+    type=PATH,
+    metavar="FILE",
+    help="Write hand and tool as a point cloud (PLY, metres, hand frame), tip in red.",
+)
 @click.option("--tf", "as_tf", is_flag=True, help="Print the transform from the hand to the tip.")
 @rig_option
 @click.option(
@@ -45,6 +51,7 @@ def export(
     recording: Path,
     target: Path | None,
     urdf: Path | None,
+    cloud: Path | None,
     as_tf: bool,
     rig: Path | None,
     method: str,
@@ -64,7 +71,8 @@ def export(
     rings), and in the hand's frame the rays, the candidates and the tip with an ellipsoid of two
     standard deviations. --urdf writes the robot with the link 'tool_tip' on a fixed joint of the
     hand. --tf prints a static_transform_publisher command, and a geometry_msgs/TransformStamped
-    as YAML. Detections and estimate are made first where they are missing or out of date.
+    as YAML. --cloud writes what was seen of hand and tool, coarse but enough to see why the tip is
+    where it is. Detections and estimate are made first where they are missing or out of date.
 
     Exits with 3 where --urdf or --tf has no estimate to take: it was refused.
 
@@ -73,13 +81,22 @@ def export(
       tooltip export pliers.mcap pliers.view.mcap
       tooltip export pliers.mcap --urdf robot_with_pliers.urdf
       tooltip export pliers.mcap --tf
+      tooltip export pliers.mcap --cloud pliers.ply
     """
     from tooltip_cli.log.recording import Topics
     from tooltip_cli.method.estimators import EstimatorParams
-    from tooltip_cli.stages.export import export_urdf, open_result, tip_transform, transform_text
+    from tooltip_cli.stages.export import (
+        export_cloud,
+        export_urdf,
+        open_result,
+        tip_transform,
+        transform_text,
+    )
 
-    if target is None and urdf is None and not as_tf:
-        raise click.UsageError("nothing to export; give OUT.mcap, --urdf FILE or --tf")
+    if target is None and urdf is None and cloud is None and not as_tf:
+        raise click.UsageError(
+            "nothing to export; give OUT.mcap, --urdf FILE, --cloud FILE or --tf"
+        )
     with progress(None, f"estimate {recording.name}") as advance:
         result = open_result(
             recording,
@@ -102,6 +119,10 @@ def export(
         export_urdf(result, urdf, overwrite=force)
         document["urdf"] = str(urdf)
         tell(urdf)
+    if cloud is not None:
+        document["points"] = export_cloud(result, cloud, overwrite=force, out=out, jobs=jobs)
+        document["cloud"] = str(cloud)
+        tell(cloud)
     if as_tf:
         document["transform"] = tip_transform(result)
         tell(transform_text(tip_transform(result)).rstrip())

@@ -22,7 +22,9 @@ COMMANDS = {
     "salvage": "Recover what is intact of a damaged recording.",
     "detect": "Find the tip's pixel in each frame by motion.",
     "estimate": "Find the 3D tip in the hand frame.",
+    "label": "Label the tip in the test frames, in the browser.",
     "evaluate": "Measure the estimate against hand labels and write a report.",
+    "calibrate": "Find clock offset and camera pose from recordings of one robot.",
     "compare": "Compare reports, frame by frame.",
     "export": "Write the result for viewers and robots.",
     "demo": "Simulate recordings and take them through every stage.",
@@ -73,6 +75,8 @@ def main(verbose: bool) -> None:
     """
     # OpenCV would print its own lines about damaged images beside ours; read when it is imported
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    # small products only: threads of the linear algebra would spin, and round differently
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # and decode a gigapixel that a file of a kilobyte claims
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**25))
     logging.basicConfig(

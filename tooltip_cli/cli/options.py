@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import math
 import re
 import sys
 import time
@@ -197,3 +198,48 @@ def progress(total: int | None, label: str) -> Iterator[Callable[[], None]]:
         if shown > start:
             sys.stderr.write("\r\x1b[K")
             sys.stderr.flush()
+
+
+class Direction(click.ParamType):  # type: ignore[type-arg]  # generic in newer click only
+    """A direction as three numbers, ``X,Y,Z``."""
+
+    name = "direction"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, float, float]:
+        """Return the three numbers."""
+        try:
+            x, y, z = (float(part) for part in value.split(","))
+        except ValueError:
+            self.fail(f"'{value}' is not three numbers like 0.1,0,0.2", param, ctx)
+        if not all(math.isfinite(part) for part in (x, y, z)) or not any((x, y, z)):
+            self.fail(f"'{value}' points nowhere", param, ctx)
+        return x, y, z
+
+
+prefer_option = click.option(
+    "--prefer",
+    type=Direction(),
+    metavar="X,Y,Z",
+    help="Of several ends (ambiguous_end), take the one farthest in this direction, hand frame; "
+    "its position in tip.json will do. For --method voting.",
+)
+
+
+def refinement_sentence(refined: dict[str, Any]) -> str:
+    """Say in words what was found out about clocks and camera."""
+    text = (
+        f"image clock {1000 * refined['time_offset_s']:+.1f} +-"
+        f"{1000 * refined['time_offset_std_s']:.1f} ms"
+    )
+    camera = refined["camera"]
+    if camera is not None:
+        turn = sum(value**2 for value in camera["rotation_deg"]) ** 0.5
+        step = 1000 * sum(value**2 for value in camera["translation_m"]) ** 0.5
+        text += f", camera turned by {turn:.2f} degrees and moved by {step:.1f} mm"
+    shares = (
+        f"{refined['support_before']:.0%} of what the images could show of the tool's end fits "
+        f"without and {refined['support_after']:.0%} with it"
+    )
+    return f"{text}: {'used' if refined['applied'] else 'not used'}; {shares}"

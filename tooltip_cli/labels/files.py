@@ -59,22 +59,35 @@ def read_labels(path: Path) -> TipLabels:
         raise TooltipError(f"{path}: labels cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
         raise TooltipError(f"{path}: labels cannot be read (not UTF-8 text)") from error
+    return parse_labels(text, str(path))
+
+
+def parse_labels(text: str, source: str) -> TipLabels:
+    """Read the text of a label file.
+
+    Args:
+        source: what to call it in messages.
+
+    Raises:
+        TooltipError: another header, or a malformed row (named by line).
+    """
     try:
         rows = list(csv.reader(io.StringIO(text, newline="")))
     except csv.Error as error:
-        raise TooltipError(f"{path}: not a CSV file ({error})") from error
+        raise TooltipError(f"{source}: not a CSV file ({error})") from error
     if not rows or tuple(rows[0]) != COLUMNS:
         found = ",".join(rows[0])[:80] if rows else "an empty file"
-        raise TooltipError(f"{path}: expected the header {','.join(COLUMNS)}, found {found}")
+        raise TooltipError(f"{source}: expected the header {','.join(COLUMNS)}, found {found}")
     stamps, pixels, states, labelers = [], [], [], []
     seen: dict[int, int] = {}
     for line, row in enumerate(rows[1:], start=2):
         if not row:
             continue
-        stamp, pixel, state, labeler = _parse_row(row, f"{path}, line {line}")
+        stamp, pixel, state, labeler = _parse_row(row, f"{source}, line {line}")
         if stamp in seen:
             raise TooltipError(
-                f"{path}, line {line}: the frame {stamp} is already labelled in line {seen[stamp]}"
+                f"{source}, line {line}: the frame {stamp} is already labelled in line "
+                f"{seen[stamp]}"
             )
         seen[stamp] = line
         stamps.append(stamp)
@@ -86,7 +99,7 @@ def read_labels(path: Path) -> TipLabels:
         np.array(pixels, dtype=float).reshape(-1, 2),
         tuple(states),
         tuple(labelers),
-        str(path),
+        source,
     )
 
 
@@ -119,6 +132,11 @@ def write_labels(path: Path, labels: TipLabels) -> None:
     Raises:
         TooltipError: it cannot be written.
     """
+    write_file(path, labels_text(labels))
+
+
+def labels_text(labels: TipLabels) -> str:
+    """Return what a label file holds, pixels to a hundredth."""
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -126,7 +144,7 @@ def write_labels(path: Path, labels: TipLabels) -> None:
     for stamp, (u, v), state, labeler in rows:
         pixel = (f"{u:.2f}", f"{v:.2f}") if state == "visible" else ("", "")
         writer.writerow([int(stamp), *pixel, state, labeler])
-    write_file(path, out.getvalue())
+    return out.getvalue()
 
 
 def match_labels(
@@ -138,15 +156,7 @@ def match_labels(
         TooltipError: a label's stamp is no image's (another recording), or its pixel lies outside
             the image.
     """
-    index = np.searchsorted(image_stamps_ns, labels.stamps_ns)
-    clipped = np.minimum(index, max(len(image_stamps_ns) - 1, 0))
-    unknown = image_stamps_ns[clipped] != labels.stamps_ns
-    if unknown.any():
-        raise TooltipError(
-            f"{labels.source}: {int(unknown.sum())} of {len(labels)} labels have stamps at which "
-            f"the recording has no image (first: {labels.stamps_ns[unknown][0]}); are they from "
-            "another recording?"
-        )
+    frames = frames_of(labels, image_stamps_ns)
     visible = np.array([state == "visible" for state in labels.states], dtype=bool)
     outside = visible & ~camera.contains(np.where(visible[:, None], labels.pixels, 0.0))
     if outside.any():
@@ -156,9 +166,25 @@ def match_labels(
             f"{labels.source}: the label ({u:.1f}, {v:.1f}) at stamp {labels.stamps_ns[row]} lies "
             f"outside the {camera.width}x{camera.height} image"
         )
-    order = np.argsort(clipped, kind="stable")
+    order = np.argsort(frames, kind="stable")
     shown = order[visible[order]]
-    pixels = TipPixels(clipped[shown].astype(np.intp), labels.pixels[shown], np.ones(len(shown)))
-    return MatchedLabels(
-        clipped[order].astype(np.intp), pixels, tuple(sorted(set(labels.labelers)))
-    )
+    pixels = TipPixels(frames[shown], labels.pixels[shown], np.ones(len(shown)))
+    return MatchedLabels(frames[order], pixels, tuple(sorted(set(labels.labelers))))
+
+
+def frames_of(labels: TipLabels, image_stamps_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.intp]:
+    """Return (L,) the image of each label, found by its exact stamp.
+
+    Raises:
+        TooltipError: a label's stamp is no image's, so they are of another recording.
+    """
+    index = np.searchsorted(image_stamps_ns, labels.stamps_ns)
+    clipped = np.minimum(index, max(len(image_stamps_ns) - 1, 0)).astype(np.intp)
+    unknown = image_stamps_ns[clipped] != labels.stamps_ns
+    if unknown.any():
+        raise TooltipError(
+            f"{labels.source}: {int(unknown.sum())} of {len(labels)} labels have stamps at which "
+            f"the recording has no image (first: {labels.stamps_ns[unknown][0]}); are they from "
+            "another recording?"
+        )
+    return clipped

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tooltip_cli.errors import TooltipError, one_of
+from tooltip_cli.log.messages import IMAGE
 
 Image = npt.NDArray[np.uint8]
 
@@ -71,6 +72,31 @@ def declared_size(data: bytes) -> tuple[int, int] | None:
         else:
             place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
     return None
+
+
+_VIEWABLE = {b"\xff\xd8\xff": "image/jpeg", b"\x89PNG\r\n\x1a\n": "image/png"}
+
+
+def viewable(message: Any, datatype: str, source: str) -> tuple[bytes, str]:
+    """Return an image message as a file that browsers show, and its media type.
+
+    JPEG and PNG pass byte for byte, whatever the message calls its format; anything else becomes
+    a PNG.
+
+    Raises:
+        TooltipError: it cannot be decoded.
+    """
+    if datatype != IMAGE:
+        data = bytes(message.data)
+        for magic, media_type in _VIEWABLE.items():
+            if data.startswith(magic):
+                return data, media_type
+        image = decode_compressed(message, False, source)
+    else:
+        image = decode_raw(message, False, source)
+    import cv2
+
+    return bytes(cv2.imencode(".png", image)[1]), "image/png"
 
 
 _RAW: dict[str, tuple[int, str | None, str | None]] = {

@@ -189,8 +189,8 @@ def label_words(row: RecordingReport) -> str:
         text += " (simulated)"
     if labels.annotator_px is not None:
         text += (
-            f"; a second annotator differs by {labels.annotator_px.mean:.1f} px on average over "
-            f"{labels.annotator_px.count} frames, a floor for every error here"
+            f"; a second labeller differs by {labels.annotator_px.mean:.1f} px on average over "
+            f"{labels.annotator_px.count} frames"
         )
         if labels.disagreements:
             text += f", and on visibility in {labels.disagreements} frames"

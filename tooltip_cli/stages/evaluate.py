@@ -50,7 +50,7 @@ from tooltip_cli.stages.estimate import (
 from tooltip_cli.stages.held_out import LABELS_SUFFIX
 from tooltip_cli.stages.measure import Case, Labelled, Protocol, measure
 
-VERSION = 1
+VERSION = 2
 DEFAULT_DIRECTORY = "report"
 _LOGGER = logging.getLogger(__name__)
 

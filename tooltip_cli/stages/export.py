@@ -12,17 +12,26 @@ import numpy as np
 import yaml
 
 from tooltip_cli.errors import RefusedError, TooltipError
+from tooltip_cli.log.ply import write_ply
 from tooltip_cli.log.recording import Recording, Topics, read_recording
 from tooltip_cli.log.scene import transform_stamped
 from tooltip_cli.log.views import Views, resolve_rig, resolve_urdf, resolve_views
 from tooltip_cli.log.whole import check_absent
 from tooltip_cli.method.estimators import EstimatorParams
 from tooltip_cli.method.types import Array
+from tooltip_cli.method.voting.estimate import check_motion
+from tooltip_cli.method.voting.params import VotingSettings
+from tooltip_cli.method.voting.volume import agreed_points, reconstruct
 from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.rig.tool_tip import TIP_LINK, urdf_with_tip
 from tooltip_cli.stages.artifacts import write_whole
 from tooltip_cli.stages.estimate import Estimated, estimate_from_images
 from tooltip_cli.stages.held_out import unlabelled
+from tooltip_cli.stages.moving import detect_edges_in
+from tooltip_cli.stages.voting import hand_edges, pair_views
+
+_CLOUD_VOXEL = 0.004  # metres
+_CLOUD_FRAMES = 4  # that must agree on a point
 
 
 @dataclass(frozen=True)
@@ -92,6 +101,50 @@ def export_urdf(result: Result, path: Path, *, overwrite: bool = False) -> None:
         )
     urdf, source = resolve_urdf(result.recording, result.rig)
     write_whole(path, urdf_with_tip(urdf, result.rig.hand_frame, result.position, source))
+
+
+def export_cloud(
+    result: Result,
+    path: Path,
+    *,
+    overwrite: bool = False,
+    out: Path | None = None,
+    jobs: int = 1,
+) -> int:
+    """Write what was voted, hand and tool in the hand frame, as a PLY point cloud.
+
+    Grey: few frames show it; white: all do. The tip is a red point of its own, if there is one.
+
+    Returns:
+        the number of points.
+
+    Raises:
+        RefusedError: the hand's motion shows nothing.
+        TooltipError: the file exists or cannot be written.
+    """
+    check_absent(path, overwrite=overwrite)
+    settings = VotingSettings()
+    allowed = unlabelled(result.recording, result.views.camera, out)
+    pairing, poses = pair_views(result.views, settings, allowed)
+    reason = check_motion(pairing, poses, settings)
+    if reason is not None:
+        raise RefusedError(f"{result.recording.path} shows no shape: {reason.text}")
+    detected = detect_edges_in(
+        result.recording, result.views, pairing, settings.moving, out=out, jobs=jobs
+    )
+    cloud = reconstruct(hand_edges(result.views, detected.edges, poses, settings), settings.voting)
+    points, frames = agreed_points(cloud.points, cloud.frames, _CLOUD_VOXEL, _CLOUD_FRAMES)
+    shade = 60 + 195 * np.minimum(frames / max(float(np.quantile(frames, 0.99)), 1.0), 1.0)
+    colors = np.repeat(shade.astype(np.uint8)[:, None], 3, axis=1)
+    tip = result.estimated.estimate.position
+    if tip is not None:
+        points, frames = np.vstack([points, tip]), np.append(frames, cloud.frame_count)
+        colors = np.vstack([colors, np.array([[255, 0, 0]], dtype=np.uint8)])
+    frame = result.rig.hand_frame
+    write_ply(
+        path, points, colors, frames, f"metres, frame {frame}, from {result.recording.path.name}"
+    )
+    return len(points)
 
 
 def tip_transform(result: Result) -> dict[str, Any]:

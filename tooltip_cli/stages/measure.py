@@ -179,6 +179,12 @@ def _notes(case: Case, without_pose: int) -> tuple[str, ...]:
     described = case.labelled.described
     if described.simulated:
         notes.append("the labels are simulated, not placed by a person")
+    apart = described.annotator_px
+    if apart is not None:
+        notes.append(
+            f"two labellers differ by {apart.mean:.1f} px on average over {apart.count} frames, a "
+            "floor for every error here"
+        )
     if not described.visible:
         notes.append("no label shows the tip, so there is no error in pixels and no baseline")
     return tuple(notes)

@@ -17,7 +17,7 @@ import numpy as np
 from tooltip_cli.method.rays import plausible
 from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.params import EndParams
-from tooltip_cli.method.voting.volume import Cloud, count_frames
+from tooltip_cli.method.voting.volume import Cloud, agreed_points, count_frames
 
 _BIN = 0.001  # metres, of the density along the axis
 _BLURS = (1.5, 2.0, 2.5, 3.0)  # bins, standard deviations tried for how blurred the end is
@@ -105,7 +105,9 @@ def locate_end(
     middle = far + _middle(near, axis, params.slab_radius, params)
     radius = float(_scatter(near, axis[:, None], params.short_slab, params.wide).rms[0])
     close = np.linalg.norm(cloud.points - middle, axis=1) < params.neighbourhood
-    surface = _surface(cloud.points[close], cloud.frames[close], params)
+    surface, _ = agreed_points(
+        cloud.points[close], cloud.frames[close], params.surface_voxel, params.surface_frames
+    )
     axis = _sharp_axis(surface - middle, near, axis, radius, params)
     width = max(1.8 * radius, 0.5 * params.slab_radius)
     middle = middle + _middle(shape.voxels - middle, axis, width, params)
@@ -212,21 +214,6 @@ def _middle(points: Array, axis: Array, radius: float, params: EndParams) -> Arr
         low, high = np.quantile(sides, [params.side_quantile, 1 - params.side_quantile], axis=0)
         centre = centre + across_axis @ turn @ ((low + high) / 2)
     return centre - (centre @ axis) * axis
-
-
-def _surface(points: Array, frames: Indices, params: EndParams) -> Array:
-    """Return one point for each small voxel that a few frames agree on."""
-    if not len(points):
-        return points
-    cells = np.floor(points / params.surface_voxel).astype(np.int64)
-    cells -= cells.min(axis=0)
-    flat = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
-    _, cell = np.unique(flat, return_inverse=True)
-    counts = np.bincount(cell)
-    means = np.stack([np.bincount(cell, axis) / counts for axis in points.T], axis=1)
-    span = int(frames.max()) + 1
-    seen = np.bincount(np.unique(cell * span + frames) // span, minlength=len(counts))
-    return means[seen >= params.surface_frames]
 
 
 def end_along(cloud: Cloud, middle: Array, axis: Array, radius: float) -> float:

@@ -49,6 +49,10 @@ class Cloud:
     step: float  # metres, of ``expected``
     score: float  # best share of expected frames that any coarse voxel was seen in
     consistent: float  # share of the moving edges that belong to something fixed to the hand
+    edges: Array  # (K, 2) normalized coordinates of all edges that may be fixed to the hand
+    edge_rows: Indices  # (K,) row of the chosen frames
+    profiles: npt.NDArray[np.float32]  # (K, depths) their log-likelihood ratios over depth
+    depths: Array  # (F, 3) first depth and step of each frame's profiles, metres; focal length
 
 
 def reconstruct(edges: HandEdges, params: VotingParams) -> Cloud:
@@ -85,6 +89,10 @@ def reconstruct(edges: HandEdges, params: VotingParams) -> Cloud:
         params.coarse,
         score,
         consistent,
+        points,
+        rows,
+        profiles,
+        depths,
     )
 
 
@@ -251,3 +259,29 @@ def count_frames(
     pairs = np.unique(flat * frames + rows[inside])
     counts = np.bincount(pairs // frames, minlength=int(np.prod(shape)))
     return counts.reshape(shape).astype(np.float32)
+
+
+def agreed_points(
+    points: Array, frames: Indices, voxel: float, least: int
+) -> tuple[Array, npt.NDArray[np.int64]]:
+    """Return one point for each voxel that enough frames agree on.
+
+    Args:
+        points: (P, 3) metres; ``frames``: (P,) the frame of each.
+        voxel: metres; ``least``: frames.
+
+    Returns:
+        (Q, 3) the mean of each voxel's points, and (Q,) how many frames have one there.
+    """
+    if not len(points):
+        return points, np.zeros(0, dtype=np.int64)
+    cells = np.floor(points / voxel).astype(np.int64)
+    cells -= cells.min(axis=0)
+    flat = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
+    _, cell = np.unique(flat, return_inverse=True)
+    counts = np.bincount(cell)
+    means = np.stack([np.bincount(cell, axis) / counts for axis in points.T], axis=1)
+    span = int(frames.max()) + 1
+    seen = np.bincount(np.unique(cell * span + frames) // span, minlength=len(counts))
+    kept = seen >= least
+    return means[kept], seen[kept]

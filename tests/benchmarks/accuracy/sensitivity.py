@@ -1,0 +1,117 @@
+"""How flat the parameters of the voting method are: each halved and doubled, the rest as it is.
+
+Example:
+    python tests/benchmarks/accuracy/sensitivity.py DIR/*.mcap --groups voting end refine
+
+Prints, for each parameter, the mean tip error of the nearest candidate over the recordings, and the
+worst, in millimetres; at the start that of the defaults. Recordings need the truth inside or beside
+them, as in run.py. Groups pairing and moving detect anew for each value, which takes longer.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tooltip_cli.log.recording import Recording, read_recording
+from tooltip_cli.log.views import Views, resolve_rig, resolve_views
+from tooltip_cli.method.rays import sphere_array
+from tooltip_cli.method.voting.estimate import estimate_by_voting
+from tooltip_cli.method.voting.moving import MovingEdges
+from tooltip_cli.method.voting.params import VotingSettings
+from tooltip_cli.rig.kinematics import inverse_transform
+from tooltip_cli.stages.held_out import unlabelled
+from tooltip_cli.stages.moving import find_moving_edges
+from tooltip_cli.stages.voting import hand_edges, pair_views
+
+SKIPPED = {"seed"}
+DETECTED = {"pairing", "moving"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("recordings", nargs="+", type=Path)
+    parser.add_argument("--groups", nargs="+", default=["voting", "end", "refine"])
+    arguments = parser.parse_args()
+    cases = [Case(path) for path in arguments.recordings if len(path.suffixes) == 1]
+    print(_row("defaults", "", cases, VotingSettings()), flush=True)
+    for group, name, value, settings in _variants(arguments.groups):
+        print(_row(f"{group}.{name}", f"{value:g}", cases, settings), flush=True)
+
+
+class Case:
+    """One recording with its truth; detects once for each pairing and detection parameters."""
+
+    def __init__(self, path: Path) -> None:
+        self.recording: Recording = read_recording(path)
+        beside = path.with_suffix(".rig.yaml")
+        rig = resolve_rig(self.recording, beside if beside.exists() else None)
+        self.views: Views = resolve_views(self.recording, rig)
+        truth = path.with_suffix(".truth.json")
+        text = truth.read_text() if truth.exists() else self.recording.attachments["truth.json"]
+        self.truth = np.array(json.loads(text)["tip_in_hand_m"])
+        self._default: MovingEdges | None = None
+
+    def error_mm(self, settings: VotingSettings) -> float:
+        """Return the nearest candidate's error; infinite where the estimate is refused."""
+        edges = self._edges(settings)
+        if edges is None:
+            return float("inf")
+        poses = inverse_transform(self.views.hand_from_camera)
+        spheres = sphere_array([(item.center, item.radius) for item in self.views.spheres])
+        found = estimate_by_voting(
+            hand_edges(self.views, edges, poses, settings), spheres, settings
+        )
+        errors = [np.linalg.norm(item.position - self.truth) for item in found.candidates]
+        return 1000 * float(min(errors, default=np.inf))
+
+    def _edges(self, settings: VotingSettings) -> MovingEdges | None:
+        usual = VotingSettings()
+        same = (settings.pairing, settings.moving) == (usual.pairing, usual.moving)
+        if same and self._default is not None:
+            return self._default
+        allowed = unlabelled(self.recording, self.views.camera, None)
+        pairing, _ = pair_views(self.views, settings, allowed)
+        if len(pairing.frames) < settings.trust.min_frames:
+            return None
+        found = find_moving_edges(
+            self.recording, self.views, pairing, settings.moving, 2, lambda: None
+        )
+        if same:
+            self._default = found
+        return found
+
+
+def _variants(groups: list[str]) -> Iterator[tuple[str, str, float, VotingSettings]]:
+    settings = VotingSettings()
+    for group in groups:
+        params: Any = getattr(settings, group)
+        for field in fields(params):
+            value = getattr(params, field.name)
+            if field.name in SKIPPED or not value:
+                continue
+            for factor in (0.5, 2.0):
+                changed = type(value)(value * factor)
+                if isinstance(value, int) and field.name in ("block", "search"):
+                    changed += 1 - changed % 2  # odd
+                if changed == value or not changed:
+                    continue
+                varied: Any = replace(params, **{field.name: changed})
+                yield group, field.name, changed, replace(settings, **{group: varied})
+
+
+def _row(name: str, value: str, cases: list[Case], settings: VotingSettings) -> str:
+    errors = np.array([case.error_mm(settings) for case in cases])
+    answered = errors[np.isfinite(errors)]
+    mean = f"{answered.mean():6.2f} {answered.max():6.2f}" if len(answered) else "     -      -"
+    return f"{name:32} {value:>8} {mean}  {len(answered)} of {len(errors)} answered"
+
+
+if __name__ == "__main__":
+    main()
