@@ -42,7 +42,7 @@ PAGES = sorted(
         *ROOT.glob("*.md"),
         *DOCS.glob("*.md"),
         *ROOT.glob("calib/*/*.md"),
-        *ROOT.glob("tests/**/*.md"),
+        *(page for page in ROOT.glob("tests/**/*.md") if "node_modules" not in page.parts),
     ]
 )
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

@@ -264,7 +264,7 @@ def test_the_recordings_own_transforms_are_replaced(estimated: None, tmp_path: P
 def test_nothing_to_export_is_wrong_usage(wrist: Log) -> None:
     done = tooltip("export", wrist.path)
     assert done.code == 2
-    assert "give OUT.mcap, --urdf FILE or --tf" in done.err
+    assert "nothing to export; give OUT.mcap" in done.err
 
 
 def test_nothing_is_overwritten(wrist: Log, estimated: None, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from tests.helpers.fuzz import Target, attempt, mutate, targets
 from tests.helpers.logs import encoded, image_of, robot_message
 from tooltip_cli.errors import DamagedLogError, TooltipError
 from tooltip_cli.log.container import iterate
-from tooltip_cli.log.images import declared_size
+from tooltip_cli.log.imagefiles import declared_size
 from tooltip_cli.log.records import MAX_CHUNK_BYTES, RecordError, chunk_head, unpack
 from tooltip_cli.log.salvage import salvage
 from tooltip_cli.log.writer import LogWriter
@@ -118,16 +118,23 @@ def test_a_giant_record_is_refused_in_a_file_that_has_room_for_it(tmp_path: Path
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
 def test_the_size_of_an_image_is_read_from_its_head(suffix: str) -> None:
     height, width = image_of(0).shape
-    assert declared_size(encoded(image_of(0), suffix)) == (width, height)
+    assert declared_size(memoryview(encoded(image_of(0), suffix))) == (width, height)
     color = np.zeros((33, 77, 3), np.uint8)
     progressive = cv2.imencode(".jpg", color, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
-    assert declared_size(progressive) == (77, 33)
+    assert declared_size(memoryview(progressive)) == (77, 33)
+
+
+def test_a_png_that_claims_more_than_it_has_is_not_given_to_a_decoder() -> None:
+    data = bytearray(encoded(image_of(0), ".png"))
+    assert data[37:41] == b"IDAT"
+    data[33:37] = b"\xff" * 4  # a decoder would make four gigabytes of room
+    assert declared_size(memoryview(data)) is None
 
 
 @given(data=st.binary(max_size=200))
 def test_a_head_of_anything_is_no_size_or_two_numbers(data: bytes) -> None:
     for start in (b"", b"\xff\xd8", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"):
-        size = declared_size(start + data)
+        size = declared_size(memoryview(start + data))
         assert size is None or (len(size) == 2 and min(size) >= 0)
 
 

@@ -110,25 +110,24 @@ def export(
     how = "reused" if result.estimated.reused else "computed"
     say(f"{recording}: {how} {result.estimated.path}")
     document: dict[str, object] = {"recording": str(recording)}
+    tell = (lambda text: None) if as_json else click.echo
     if target is not None:
-        document["mcap"] = str(target)
         document["topics"] = _export_log(result, target, out, jobs, force)
+        document["mcap"] = str(target)
+        tell(target)
     if urdf is not None:
         export_urdf(result, urdf, overwrite=force)
         document["urdf"] = str(urdf)
+        tell(urdf)
     if cloud is not None:
         document["points"] = export_cloud(result, cloud, overwrite=force, out=out, jobs=jobs)
         document["cloud"] = str(cloud)
+        tell(cloud)
     if as_tf:
         document["transform"] = tip_transform(result)
+        tell(transform_text(tip_transform(result)).rstrip())
     if as_json:
         print_json(document)
-        return
-    for path in (target, urdf, cloud):
-        if path is not None:
-            click.echo(path)
-    if as_tf:
-        click.echo(transform_text(tip_transform(result)), nl=False)
 
 
 def _export_log(

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import struct
+import contextlib
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from tooltip_cli.errors import TooltipError, one_of
+from tooltip_cli.log.imagefiles import declared_size
 from tooltip_cli.log.messages import IMAGE
 
 Image = npt.NDArray[np.uint8]
 
 _MAX_PIXELS = 1 << 25  # 7680x4320 and a little more: decoding takes up to 9 bytes for each
-_HEADER_BYTES = 1 << 20  # in which the size of a JPEG stands, behind thumbnails and profiles
 
 
 def decode_compressed(message: Any, gray: bool, source: str) -> Image:
@@ -24,54 +24,30 @@ def decode_compressed(message: Any, gray: bool, source: str) -> Image:
         source: what to call it in messages.
 
     Raises:
-        TooltipError: not an image, or one too large.
+        TooltipError: neither JPEG nor PNG, damaged, or too large.
     """
     import cv2
 
-    size = declared_size(bytes(message.data[:_HEADER_BYTES]))
+    data = memoryview(message.data)
+    size = declared_size(data)
     if size is not None and size[0] * size[1] > _MAX_PIXELS:
         raise TooltipError(
             f"{source} claims {size[0]}x{size[1]} pixels, more than are read; it is damaged, or "
             "needs a smaller resolution"
         )
-    data = np.frombuffer(message.data, dtype=np.uint8)
     mode = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
-    try:
+    image = None
+    if size is not None:
         # the log's word on orientation is the pixels' own; EXIF would turn the intrinsics
-        image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
-    except cv2.error:  # raised for sizes beyond OpenCV's limit
-        image = None
+        mode |= cv2.IMREAD_IGNORE_ORIENTATION
+        with contextlib.suppress(cv2.error):
+            image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), mode)
     if image is None:
         kind = message.format or "no format"
         raise TooltipError(
             f"{source} ({kind}) cannot be decoded; it is damaged, so record it again"
         )
     return np.asarray(image, dtype=np.uint8)
-
-
-def declared_size(data: bytes) -> tuple[int, int] | None:
-    """Return width and height by the head of a JPEG or PNG file; None where it does not say.
-
-    Source: ITU-T T.81, annex B (frame headers SOF0 to SOF15); PNG specification, IHDR.
-    """
-    if data.startswith(b"\x89PNG\r\n\x1a\n") and len(data) >= 24:
-        width, height = struct.unpack_from(">II", data, 16)
-        return width, height
-    place = 2 if data.startswith(b"\xff\xd8") else len(data)
-    while place + 9 <= len(data):
-        if data[place] != 0xFF:
-            return None
-        marker = data[place + 1]
-        if marker == 0xFF:  # padding
-            place += 1
-        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack_from(">HH", data, place + 5)
-            return width, height
-        elif marker == 0x01 or 0xD0 <= marker <= 0xD9:  # stand alone
-            place += 2
-        else:
-            place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
-    return None
 
 
 _VIEWABLE = {b"\xff\xd8\xff": "image/jpeg", b"\x89PNG\r\n\x1a\n": "image/png"}
