@@ -116,7 +116,7 @@ def best_fit(
             for start in _about(axis, params.start_turn_deg)
         ]
         fits = [fit for fit in (best, *turned) if fit is not None]
-        best = max(fits, key=lambda fit: fit.support(params), default=None)
+        best = max(fits, key=lambda fit: fit.agreement(params), default=None)
     if best is None or best.agreement(params) < params.min_agreement:
         return None
     point = point_of(near, best.position, best.axis, looked_at(radius), params)
