@@ -20,6 +20,7 @@ COMMANDS = {
     "detect": "Find the tip's pixel in each frame by motion.",
     "estimate": "Find the 3D tip in the hand frame.",
     "evaluate": "Measure the estimate against hand labels and write a report.",
+    "run": "Take many recordings through every stage, resumable.",
     "calibrate": "Find clock offset and camera pose from recordings of one robot.",
     "compare": "Compare reports, frame by frame.",
     "demo": "Simulate recordings and take them through every stage.",
