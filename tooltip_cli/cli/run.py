@@ -70,6 +70,12 @@ def _part(
     "share of the machine's memory.",
 )
 @click.option(
+    "--dask",
+    metavar="ADDRESS",
+    help="Scheduler of a Dask cluster, such as tcp://host:8786, whose workers do the work; or "
+    "'local' for one of --jobs workers on this machine.",
+)
+@click.option(
     "--part",
     callback=_part,
     metavar="K/N",
@@ -93,6 +99,7 @@ def run(
     method: str,
     jobs: int,
     memory: float | None,
+    dask: str | None,
     part: tuple[int, int] | None,
     verify: bool,
     out: Path | None,
@@ -119,14 +126,15 @@ def run(
       tooltip run shelf --jobs 8
       tooltip run 'logs/*/*.mcap' --rig rig.yaml --out results
       tooltip run manifest.csv --part 3/16
+      tooltip run /data/shelf --dask tcp://10.0.0.1:8786
     """
     from tooltip_cli.log.recording import Topics
     from tooltip_cli.method.estimators import EstimatorParams
     from tooltip_cli.stages.shelf.plan import part_of, read_shelf
-    from tooltip_cli.stages.shelf.pool import on_processes
     from tooltip_cli.stages.shelf.run import plan_run
-    from tooltip_cli.stages.shelf.work import work_on
 
+    if dask not in (None, "local") and memory is not None:
+        raise click.UsageError("--memory is for processes started here; Dask's workers have theirs")
     found = read_shelf(shelf)
     items, name = found.items, "results"
     if part is not None:
@@ -141,12 +149,24 @@ def run(
         force=force,
         verify=verify,
     )
-    engine = partial(on_processes, work_on, jobs=jobs, memory_bytes=_memory(memory, jobs))
+    engine = _engine(dask, jobs, _memory(memory, jobs))
     rows = _carry_out(plan, engine, jobs, out / name, say if as_json else click.echo)
     if as_json:
         print_json(rows)
     if rows["failed"]:
         ctx.exit(1)
+
+
+def _engine(dask: str | None, jobs: int, memory_bytes: int) -> Engine:
+    from tooltip_cli.stages.shelf.cluster import on_dask
+    from tooltip_cli.stages.shelf.pool import on_processes
+    from tooltip_cli.stages.shelf.work import key_of, work_on
+
+    if dask is None:
+        return partial(on_processes, work_on, jobs=jobs, memory_bytes=memory_bytes)
+    return partial(
+        on_dask, work_on, address=dask, workers=jobs, memory_bytes=memory_bytes, key_of=key_of
+    )
 
 
 def _memory(gib: float | None, jobs: int) -> int:
@@ -182,7 +202,8 @@ def _carry_out(
 def _line(row: Row, reused: bool) -> str:
     how = ", reused" if reused else ""
     if row.status != "ok":
-        text = f"{row.status} ({row.code}): {row.reason}"
+        code = "" if row.code == row.status else f" ({row.code})"
+        text = f"{row.status}{code}: {row.reason}"
     else:
         tip = (row.tip_x_m, row.tip_y_m, row.tip_z_m)
         axes = zip("xyz", tip, strict=True)

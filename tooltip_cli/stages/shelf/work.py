@@ -49,6 +49,12 @@ class Task:
     params: EstimatorParams
     force: bool = False  # compute even where a fresh artifact exists
     trust: bool = True  # take a stored row with the same inputs for what it says
+    version: str = __version__  # of the program that asks
+
+
+def key_of(task: Task) -> str:
+    """Return a name that no other task has."""
+    return f"{task.inputs}{'-anew' if task.force else ''}"
 
 
 @dataclass(frozen=True)
@@ -119,6 +125,7 @@ def work_on(task: Task) -> Outcome:
     _one_thread()
     started = time.perf_counter()
     try:
+        _check_version(task)
         outcome = _through_the_stages(task)
     except TooltipError as error:
         outcome = Outcome(failed_row(task, "failed", str(error)), False)
@@ -135,6 +142,14 @@ def work_on(task: Task) -> Outcome:
     except TooltipError as error:
         return Outcome(failed_row(task, "failed", str(error)), False)
     return outcome
+
+
+def _check_version(task: Task) -> None:
+    if task.version != __version__:
+        raise TooltipError(
+            f"this worker has tooltip {__version__} and was asked by {task.version}; install the "
+            "same version on both"
+        )
 
 
 def _one_thread() -> None:
