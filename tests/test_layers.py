@@ -35,6 +35,8 @@ FREE = {"errors", "resources", "machine_code", ""}
 HEAVY = (
     "av",
     "cv2",
+    "dask",
+    "distributed",
     "matplotlib",
     "numba",
     "numpy",
@@ -223,7 +225,7 @@ def test_help_answers_without_loading_anything_heavy(arguments: list[str]) -> No
     assert not loaded_by(code) & {*HEAVY, "mcap", "yaml"}
 
 
-@pytest.mark.parametrize("command", ["detect", "estimate", "evaluate", "label", "record"])
+@pytest.mark.parametrize("command", ["detect", "estimate", "evaluate", "label", "record", "run"])
 def test_help_of_a_command_loads_nothing_heavy(command: str) -> None:
     code = (
         "from tooltip_cli.cli.main import main\n"

@@ -24,6 +24,7 @@ COMMANDS = {
     "estimate": "Find the 3D tip in the hand frame.",
     "label": "Label the tip in the test frames, in the browser.",
     "evaluate": "Measure the estimate against hand labels and write a report.",
+    "run": "Take many recordings through every stage, resumable.",
     "calibrate": "Find clock offset and camera pose from recordings of one robot.",
     "compare": "Compare reports, frame by frame.",
     "export": "Write the result for viewers and robots.",

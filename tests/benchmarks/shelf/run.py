@@ -1,0 +1,131 @@
+"""What a shelf costs beside the work on its recordings.
+
+python tests/benchmarks/shelf/run.py engines            overhead of a recording, start-up
+python tests/benchmarks/shelf/run.py rows FOLDER        planning, resuming, tables of 10,000 rows
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from tooltip_cli.stages.shelf.cluster import on_dask
+from tooltip_cli.stages.shelf.plan import read_shelf
+from tooltip_cli.stages.shelf.pool import on_processes
+from tooltip_cli.stages.shelf.run import plan_run, write_results
+from tooltip_cli.stages.shelf.table import Row
+from tooltip_cli.stages.shelf.work import Outcome, Task, store_row, work_on
+
+SIZES = (625, 1250, 2500, 5000, 10_000)
+
+
+def nothing(task: int) -> int:
+    """Return at once."""
+    return task
+
+
+def engines(tasks: int = 2000) -> None:
+    """Print start-up, the first answer, and the cost of each further task."""
+    for name, engine in (
+        ("processes, 1", on_processes(nothing, range(tasks), 1)),
+        ("processes, 2", on_processes(nothing, range(tasks), 2)),
+        ("dask local, 2", on_dask(nothing, range(tasks), "local", 2)),
+    ):
+        start = time.perf_counter()
+        first = 0.0
+        for number, _ in enumerate(engine):
+            first = first or time.perf_counter() - start
+            last = time.perf_counter() - start
+            assert number < tasks
+        each = 1000 * (last - first) / (tasks - 1)
+        print(f"{name}: first answer after {first:.2f} s, then {each:.3f} ms a task")
+
+
+@contextmanager
+def timed(times: dict[str, float], name: str) -> Iterator[None]:
+    """Note how long the block takes."""
+    start = time.perf_counter()
+    yield
+    times[name] = time.perf_counter() - start
+
+
+def make(folder: Path, size: int) -> Path:
+    """Make a shelf of small files, as many as asked for, a hundred in a folder."""
+    shelf = folder / f"shelf-{size}"
+    for number in range(size):
+        path = shelf / f"{number // 100:04d}" / f"r{number:06d}.mcap"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            path.write_bytes(b"\x89MCAP0\r\n" + b"0" * 100)
+            path.with_suffix(".labels.csv").write_text("stamp_ns,u,v,state,labeler\n")
+    return shelf
+
+
+def synthetic(task: Task, number: int) -> Row:
+    """Return a row such as an evaluated recording has, with its tip file."""
+    rng = np.random.default_rng(number)
+    tip = task.folder / f"{task.item.recording.stem}.tip.json"
+    tip.parent.mkdir(parents=True, exist_ok=True)
+    tip.write_text("{}")
+    values = asdict(work_on(replace(task, version="0")).row)
+    numbers = {name: float(rng.normal()) for name in values if name.startswith(("tip_", "cov_"))}
+    numbers |= {name: float(rng.gamma(2)) for name in ("error_px", "baseline_px", "seconds")}
+    del numbers["tip_error_mm"], numbers["tip_file"]
+    return Row(**{**values, **numbers, "status": "ok", "reason": None, "tip_file": str(tip)})
+
+
+def one_size(folder: Path, size: int) -> None:
+    """Print times and memory of one size as JSON; a process of its own, for its memory's sake."""
+    shelf, times = make(folder, size), dict[str, float]()
+    with timed(times, "plan"):
+        found = read_shelf(str(shelf))
+        plan = plan_run(found.items, found.out)
+    for number, task in enumerate(plan.tasks):
+        store_row(task, synthetic(task, number))
+    for task in plan.tasks[::100]:
+        (task.folder / "row.json").unlink()
+    with timed(times, "resume"):
+        plan = plan_run(read_shelf(str(shelf)).items, found.out)
+    assert len(plan.tasks) == len(range(0, size, 100))
+    rows = [Outcome(synthetic(task, number), False).row for number, task in enumerate(plan.tasks)]
+    with timed(times, "table"):
+        write_results(plan, rows, found.out / "results")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(json.dumps({"size": size, "peak_mb": peak, **times}))
+
+
+def rows(folder: Path) -> None:
+    """Print times and memory of all sizes, and the exponents of their growth."""
+    found = []
+    for size in SIZES:
+        command = [sys.executable, __file__, "one", str(folder), "--size", str(size)]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        found.append(json.loads(done.stdout))
+        print(done.stdout.strip())
+    for name in ("plan", "resume", "table"):
+        slope = np.polyfit(np.log(SIZES), np.log([item[name] for item in found]), 1)[0]
+        print(f"{name}: grows with the power {slope:.2f} of the number of rows")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=("engines", "rows", "one"))
+    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("--size", type=int)
+    given = parser.parse_args()
+    if given.what == "engines":
+        engines()
+    elif given.what == "rows":
+        rows(given.folder)
+    else:
+        one_size(given.folder, given.size)
