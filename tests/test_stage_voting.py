@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,8 @@ from tooltip_cli.log.recording import Topics, read_recording
 from tooltip_cli.log.views import resolve_rig, resolve_views
 from tooltip_cli.method.voting.moving import MovingEdges
 from tooltip_cli.method.voting.params import VotingSettings
+from tooltip_cli.rig.rigfile import load_rig
+from tooltip_cli.stages.calibrate import write_rig
 from tooltip_cli.stages.voting import pair_views
 
 
@@ -190,3 +192,46 @@ def test_motion_that_cannot_show_the_tip_is_refused(
     again = tooltip("estimate", run.recording)
     assert again.code == 3
     assert f"reused {run.tip_path}" in again.err
+
+
+def late_rig(run: Run, folder: Path) -> Path:
+    """Write the recording's rig with image stamps that are put 30 ms too late."""
+    recording = read_recording(run.recording, Topics())
+    rig = resolve_rig(recording, None)
+    return write_rig(replace(rig, time_offset_s=0.03), folder)
+
+
+def test_a_wrong_clock_is_put_right(run: Run, tmp_path: Path) -> None:
+    late = late_rig(run, tmp_path / "late")
+    # images are stamped at the end of their exposure: half of it before is right
+    half_exposure = truth(run.recording)["mid_exposure_before_stamp_s"]
+    done = tooltip("estimate", run.recording, "--rig", late, "--refine", "time", "--json")
+    assert done.code == 0, done.err
+    refined = json.loads(done.out)["refined"]
+    assert refined["applied"]
+    assert refined["camera"] is None
+    assert refined["time_offset_s"] == pytest.approx(-0.03 - half_exposure, abs=0.005)
+    again = tooltip("estimate", run.recording, "--rig", late, "--refine", "time", "--json")
+    assert "reused" in again.err
+    assert json.loads(again.out)["refined"] == refined
+
+
+def test_calibrate_writes_a_rig_that_is_right(run: Run, tmp_path: Path) -> None:
+    late = late_rig(run, tmp_path / "late")
+    out = tmp_path / "right"
+    done = tooltip("calibrate", run.recording, "--rig", late, "--clocks-only", "--out", out)
+    assert done.code == 0, done.err
+    assert "image clock -" in done.out
+    assert "used" in done.out
+    rig = load_rig(out / "rig.yaml")
+    half_exposure = truth(run.recording)["mid_exposure_before_stamp_s"]
+    assert rig.time_offset_s == pytest.approx(-half_exposure, abs=0.005)
+    again = tooltip("calibrate", run.recording, "--rig", late, "--out", out)
+    assert again.code == 1
+    assert "--force" in again.err
+
+
+def test_refining_needs_images(run: Run) -> None:
+    wrong = tooltip("estimate", run.recording, "--method", "kmeans", "--refine", "time")
+    assert wrong.code == 2
+    assert "voting" in wrong.err

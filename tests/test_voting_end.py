@@ -100,7 +100,19 @@ def cloud_of(draw: Draw, turn: Array, seed: int, frames: int = FRAMES) -> Cloud:
 
 def cloud(points: Array, rows: Indices, frames: int) -> Cloud:
     expected = np.full((3, 3, 3), frames, dtype=np.float32)
-    return Cloud(points, rows, frames, expected, 0.008, score=1.0, consistent=1.0)
+    return Cloud(
+        points,
+        rows,
+        frames,
+        expected,
+        0.008,
+        score=1.0,
+        consistent=1.0,
+        edges=np.zeros((0, 2)),
+        edge_rows=np.zeros(0, dtype=np.intp),
+        profiles=np.zeros((0, 2), dtype=np.float32),
+        depths=np.zeros((frames, 3)),
+    )
 
 
 def turned(name: str, seed: int) -> tuple[Cloud, Array, Array, Array]:

@@ -18,6 +18,7 @@ from tooltip_cli.cli.options import (
     print_json,
     progress,
     recordings_argument,
+    refinement_sentence,
     rig_option,
     say,
     topic_options,
@@ -41,6 +42,12 @@ from tooltip_cli.cli.options import (
     metavar="CSV",
     help="Estimate from these hand labels instead of detections (the paper's baseline).",
 )
+@click.option(
+    "--refine",
+    type=click.Choice(("time", "all")),
+    help="Find the offset of the image clock (time), and where the camera really is (all), from "
+    "the same images, and use what clearly helps. 'tooltip calibrate' writes it as a rig file.",
+)
 @jobs_option
 @out_option
 @topic_options
@@ -53,6 +60,7 @@ def estimate(
     rig: Path | None,
     method: str,
     from_labels: Path | None,
+    refine: str | None,
     jobs: int,
     out: Path | None,
     image: str | None,
@@ -78,6 +86,8 @@ def estimate(
     from tooltip_cli.method.estimators import EstimatorParams
     from tooltip_cli.stages.estimate import estimate as run
 
+    if refine is not None and (method != "voting" or from_labels is not None):
+        raise click.UsageError("--refine works from images with --method voting alone")
     documents: list[dict[str, Any]] = []
     refusals = 0
     check_names(recordings, out)
@@ -89,6 +99,7 @@ def estimate(
                 topics=Topics(image=image, joints=joints, info=info, pose=pose),
                 params=EstimatorParams(method=method),
                 from_labels=from_labels,
+                refine=refine,
                 out=out,
                 force=force,
                 jobs=jobs,
@@ -102,6 +113,8 @@ def estimate(
         say(f"{path}: {'reused' if found.reused else 'computed'} {found.path}")
         for reason in found.estimate.reasons:
             say(f"{path}: {found.estimate.status}: {reason.code}: {reason.text}")
+        if found.estimate.refinement is not None:
+            say(f"{path}: {refinement_sentence(found.document['refined'])}")
         refusals += found.estimate.position is None
         documents.append(found.document)
         if not as_json:

@@ -23,6 +23,7 @@ COMMANDS = {
     "detect": "Find the tip's pixel in each frame by motion.",
     "estimate": "Find the 3D tip in the hand frame.",
     "evaluate": "Measure the estimate against hand labels and write a report.",
+    "calibrate": "Find clock offset and camera pose from recordings of one robot.",
     "compare": "Compare reports, frame by frame.",
     "export": "Write the result for viewers and robots.",
     "demo": "Simulate recordings and take them through every stage.",
@@ -75,6 +76,8 @@ def main(verbose: bool) -> None:
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     # and decode a gigapixel that a file of a kilobyte claims
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**25))
+    # small products only: threads of the linear algebra would spin, and round differently
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.basicConfig(
         stream=sys.stderr,
         level=logging.INFO if verbose else logging.WARNING,

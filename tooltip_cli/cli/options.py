@@ -197,3 +197,21 @@ def progress(total: int | None, label: str) -> Iterator[Callable[[], None]]:
         if shown > start:
             sys.stderr.write("\r\x1b[K")
             sys.stderr.flush()
+
+
+def refinement_sentence(refined: dict[str, Any]) -> str:
+    """Say in words what was found out about clocks and camera."""
+    text = (
+        f"image clock {1000 * refined['time_offset_s']:+.1f} +-"
+        f"{1000 * refined['time_offset_std_s']:.1f} ms"
+    )
+    camera = refined["camera"]
+    if camera is not None:
+        turn = sum(value**2 for value in camera["rotation_deg"]) ** 0.5
+        step = 1000 * sum(value**2 for value in camera["translation_m"]) ** 0.5
+        text += f", camera turned by {turn:.2f} degrees and moved by {step:.1f} mm"
+    shares = (
+        f"{refined['support_before']:.0%} of what the images could show of the tool's end fits "
+        f"without and {refined['support_after']:.0%} with it"
+    )
+    return f"{text}: {'used' if refined['applied'] else 'not used'}; {shares}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from tooltip_cli.log.sync import bracket, interpolate, interpolate_poses
 from tooltip_cli.rig.camera import CameraModel
 from tooltip_cli.rig.kinematics import (
     KinematicChain,
+    Mount,
     inverse_transform,
     rotation_from_quaternion,
 )
@@ -22,6 +23,9 @@ from tooltip_cli.rig.rigfile import Rig, Sphere, load_rig, parse_rig
 
 Array = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
+
+CORRECTED = "_corrected"
+"""Added to a camera frame's name where its pose is put right."""
 
 MAX_GAP_NS = 100_000_000
 """Longest gap between joint samples that is bridged: a wrist turns some degrees in 0.1 s."""
@@ -106,6 +110,26 @@ def resolve_views(recording: Recording, rig: Rig) -> Views:
     else:
         transforms = _from_joints(recording, rig, query)
     return Views(camera, recording.image_stamps_ns, transforms, rig.spheres)
+
+
+def corrected_rig(
+    recording: Recording, rig: Rig, time_offset_s: float, corrected_from_camera: Array | None
+) -> Rig:
+    """Return a rig with clocks and camera put right.
+
+    Args:
+        time_offset_s: to add to image stamps, besides what the rig adds.
+        corrected_from_camera: (4, 4), or None: the camera is where the rig says.
+    """
+    rig = replace(rig, time_offset_s=rig.time_offset_s + time_offset_s)
+    if corrected_from_camera is None:
+        return rig
+    inverse = inverse_transform(corrected_from_camera)
+    if rig.mount is not None:
+        mount = Mount.at(rig.mount.parent, rig.mount.parent_from_camera @ inverse)
+        return replace(rig, mount=mount)
+    frame = rig.camera_frame or recording.image_frame
+    return replace(rig, camera_frame=frame + CORRECTED, mount=Mount.at(frame, inverse))
 
 
 def _check_image_size(recording: Recording, camera: CameraModel) -> None:

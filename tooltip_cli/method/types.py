@@ -49,6 +49,30 @@ class Candidate:
     support: float  # share of the evidence that speaks for it, 0 to 1
     covariance: Array | None = None  # (3, 3) m^2; None: not known for this place
     axis: Array | None = None  # (3,) unit vector out of the tool's end, hand frame
+    axis_std: float | None = None  # rad, standard deviation of its direction either way
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What is to be put right about clocks and camera."""
+
+    time_offset: float = 0.0  # seconds to add to image stamps
+    rotation: Array | None = None  # (3,) rotation vector, rad, camera frame; None: not asked for
+    translation: Array | None = None  # (3,) metres, camera frame
+
+    @property
+    def corrected_from_camera(self) -> Array:
+        """(4, 4): takes points in the camera's frame as it was said to where it really is."""
+        result = np.eye(4)
+        if self.rotation is None or self.translation is None:
+            return result
+        result[:3, 3] = self.translation
+        angle = float(np.linalg.norm(self.rotation))
+        if angle > 0:  # Rodrigues' formula
+            x, y, z = self.rotation / angle
+            cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            result[:3, :3] += np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
+        return result
 
 
 @dataclass(frozen=True)
@@ -57,6 +81,17 @@ class Reason:
 
     code: str  # machine-readable, e.g. depth_unobservable
     text: str  # a sentence for a person
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """What was found out about clocks and camera, and whether it was used."""
+
+    correction: Correction
+    deviations: Array  # (1,) or (7,) standard deviations of offset, rotation and translation
+    applied: bool  # clearly more frames fit with it
+    support_before: float  # share of what images could show of the end that fits
+    support_after: float
 
 
 @dataclass(frozen=True)
@@ -69,6 +104,7 @@ class TipEstimate:
     candidates: tuple[Candidate, ...]  # the first is the estimate
     reasons: tuple[Reason, ...]
     frames_used: int
+    refinement: Refinement | None = None  # of the rig, where it was asked for
 
     @property
     def status(self) -> str:

@@ -30,6 +30,18 @@ class Mount:
     xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)  # metres
     rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)  # radians, fixed-axis roll, pitch, yaw
 
+    @classmethod
+    def at(cls, parent: str, parent_from_camera: Array) -> Mount:
+        """Return the mount at a pose (4, 4)."""
+        r = parent_from_camera[:3, :3]
+        pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
+        # at a pitch of 90 degrees roll and yaw turn about the same axis: roll stands for both
+        upright = np.hypot(r[0, 0], r[1, 0]) > 1e-9
+        roll = np.arctan2(r[2, 1], r[2, 2]) if upright else np.arctan2(-r[1, 2], r[1, 1])
+        yaw = np.arctan2(r[1, 0], r[0, 0]) if upright else 0.0
+        x, y, z = (float(value) for value in parent_from_camera[:3, 3])
+        return cls(parent, (x, y, z), (float(roll), float(pitch), float(yaw)))
+
     @property
     def parent_from_camera(self) -> Array:
         """(4, 4) transform."""

@@ -20,13 +20,18 @@ from tooltip_cli.method.detector import FEW_EDGES, NO_MOTION, Detections, Detect
 from tooltip_cli.method.estimators import EstimationInput, EstimatorParams, estimate_tip
 from tooltip_cli.method.rays import rays_in_hand, sphere_array
 from tooltip_cli.method.types import (
+    Array,
     Candidate,
     Reason,
+    Refinement,
     TipEstimate,
     TipPixels,
     refused,
 )
+from tooltip_cli.method.voting.pairing import Pairing
+from tooltip_cli.method.voting.volume import HandEdges
 from tooltip_cli.rig.kinematics import inverse_transform
+from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.stages.artifacts import (
     artifact_path,
     digest,
@@ -37,6 +42,12 @@ from tooltip_cli.stages.artifacts import (
     stage_key,
     write_whole,
 )
+from tooltip_cli.stages.calibrate import (
+    put_right,
+    refine_rig,
+    refinement_document,
+    refinement_from_document,
+)
 from tooltip_cli.stages.detect import Detected, detect_in
 from tooltip_cli.stages.held_out import unlabelled
 from tooltip_cli.stages.moving import VERSION as EDGES_VERSION
@@ -44,7 +55,7 @@ from tooltip_cli.stages.moving import DetectedEdges
 from tooltip_cli.stages.voting import vote
 
 SUFFIX = ".tip.json"
-VERSION = 1
+VERSION = 2
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -69,6 +80,7 @@ def estimate(
     params: EstimatorParams | None = None,
     detector: DetectorParams | None = None,
     from_labels: Path | None = None,
+    refine: str | None = None,
     out: Path | None = None,
     force: bool = False,
     jobs: int = 1,
@@ -82,12 +94,15 @@ def estimate(
     Args:
         rig: rig file; default: the one stored in the recording.
         from_labels: a label file to estimate from instead of detections (the paper's baseline).
+        refine: ``time`` or ``all``: put clocks, or clocks and camera, right where that helps; for
+            the method ``voting`` and from images alone.
 
     Raises:
         TooltipError: anything wrong with the inputs.
     """
     recording = read_recording(recording_path, topics or Topics())
-    views = resolve_views(recording, resolve_rig(recording, rig))
+    resolved = resolve_rig(recording, rig)
+    views = resolve_views(recording, resolved)
     params = params or EstimatorParams()
     if from_labels is not None:
         labels = match_labels(read_labels(from_labels), recording.image_stamps_ns, views.camera)
@@ -100,6 +115,7 @@ def estimate(
             params,
             allowed,
             detector=detector,
+            refine=None if refine is None else (resolved, refine),
             out=out,
             force=force,
             jobs=jobs,
@@ -125,6 +141,7 @@ def estimate_from_images(
     allowed: npt.NDArray[np.bool_],
     *,
     detector: DetectorParams | None = None,
+    refine: tuple[Rig, str] | None = None,
     out: Path | None = None,
     detected_out: Path | None = None,
     force: bool = False,
@@ -136,6 +153,7 @@ def estimate_from_images(
     Args:
         allowed: (N,) images that may be used; a detection belongs to its first image.
         detector: of the paper's methods, ``kmeans`` and ``map``.
+        refine: the rig that the views are by, and what of it to put right (see :func:`estimate`).
         detected_out: directory for what is detected; default: ``out``.
     """
     detected_out = detected_out or out
@@ -148,14 +166,37 @@ def estimate_from_images(
         )
     origin = {"recording": recording.sha256, "image_topic": recording.image_topic}
     parents = {**origin, "allowed": digest(allowed), "edges_version": str(EDGES_VERSION)}
+    if refine is not None:
+        parents["refine"] = refine[1]
     used: list[DetectedEdges] = []
 
     def compute() -> TipEstimate:
+        refinements: list[Refinement] = []
+
+        def better(edges: HandEdges, pairing: Pairing, spheres: Array) -> Views | None:
+            if refine is None:
+                return None
+            rig, what = refine
+            found = refine_rig(
+                recording, rig, what == "all", params.voting, edges, pairing, spheres
+            )
+            refinements.extend([] if found is None else [found])
+            if found is None or not found.applied:
+                return None
+            return resolve_views(recording, put_right(recording, rig, found.correction))
+
         result, edges = vote(
-            recording, views, params.voting, allowed, out=detected_out, jobs=jobs, on_frame=on_pair
+            recording,
+            views,
+            params.voting,
+            allowed,
+            out=detected_out,
+            jobs=jobs,
+            on_frame=on_pair,
+            put_right=better,
         )
         used.extend([] if edges is None else [edges])
-        return result
+        return replace(result, refinement=refinements[0] if refinements else None)
 
     found = _estimate(recording, views, compute, parents, params, out, force)
     return Estimated(*found, used[0] if used else None)
@@ -290,7 +331,10 @@ def tip_document(result: TipEstimate, origin: dict[str, Any]) -> dict[str, Any]:
             candidate["covariance_m2"] = plain(item.covariance)
         if item.axis is not None:
             candidate["axis"] = plain(item.axis)
+        if item.axis_std is not None:
+            candidate["axis_std_deg"] = float(np.degrees(item.axis_std))
         candidates.append(candidate)
+    refined = result.refinement
     return {
         "status": result.status,
         "tip": None if result.position is None else tip,
@@ -298,6 +342,7 @@ def tip_document(result: TipEstimate, origin: dict[str, Any]) -> dict[str, Any]:
         "reasons": [{"code": reason.code, "text": reason.text} for reason in result.reasons],
         "method": result.method,
         "frames_used": result.frames_used,
+        **({} if refined is None else {"refined": refinement_document(refined)}),
         "provenance": origin,
     }
 
@@ -320,16 +365,24 @@ def estimate_from_document(document: dict[str, Any], path: Path) -> TipEstimate:
                     float(item["support"]),
                     _array(item.get("covariance_m2")),
                     _array(item.get("axis")),
+                    _radians(item.get("axis_std_deg")),
                 )
                 for item in document["candidates"]
             ),
             reasons=tuple(Reason(item["code"], item["text"]) for item in document["reasons"]),
             frames_used=int(document["frames_used"]),
+            refinement=(
+                refinement_from_document(document["refined"]) if "refined" in document else None
+            ),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise TooltipError(
             f"{path} is not a tip file ({error!r}); --force makes it anew"
         ) from error
+
+
+def _radians(degrees: float | None) -> float | None:
+    return None if degrees is None else float(np.radians(degrees))
 
 
 def _array(value: Any) -> npt.NDArray[np.float64] | None:

@@ -42,8 +42,13 @@ def vote(
     out: Path | None,
     jobs: int,
     on_frame: Callable[[], None],
+    put_right: Callable[[HandEdges, Pairing, Array], Views | None] = lambda *_: None,
 ) -> tuple[TipEstimate, DetectedEdges | None]:
     """Estimate the tip from the allowed images (N,); no edges where the motion shows nothing.
+
+    Args:
+        put_right: returns views by a better rig, given the edges, the pairing, which is kept, and
+            the hand's spheres (S, 4); None: this one is used.
 
     Raises:
         TooltipError: an image cannot be decoded, or the edges not written.
@@ -57,6 +62,10 @@ def vote(
     )
     edges = hand_edges(views, detected.edges, camera_from_hand, settings)
     spheres = sphere_array([(sphere.center, sphere.radius) for sphere in views.spheres])
+    better = put_right(edges, pairing, spheres)
+    if better is not None:
+        poses = inverse_transform(better.hand_from_camera)
+        edges = hand_edges(better, detected.edges, poses, settings)
     return estimate_by_voting(edges, spheres, settings), detected
 
 

@@ -11,6 +11,7 @@ from tooltip_cli.method.types import Array, Candidate, Reason, TipEstimate, refu
 from tooltip_cli.method.voting.end import Shape, ToolEnd, far_voxels, locate_end, tool_shape
 from tooltip_cli.method.voting.pairing import Pairing
 from tooltip_cli.method.voting.params import EndParams, TrustParams, VotingSettings
+from tooltip_cli.method.voting.refine import RefinedEnd, refine_end
 from tooltip_cli.method.voting.volume import Cloud, HandEdges, reconstruct
 
 METHOD = "voting"
@@ -67,7 +68,7 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     if not len(shape.voxels):
         return refused(METHOD, used, _only_the_hand())
     candidates = [
-        _candidate(cloud, shape, shape.voxels[far], spheres, edges.reach, settings)
+        _candidate(edges, cloud, shape, shape.voxels[far], spheres, settings)
         for far in far_voxels(shape, settings.end)
     ]
     first = candidates[0]
@@ -80,20 +81,51 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     return TipEstimate(METHOD, first.position, first.covariance, tuple(candidates), reasons, used)
 
 
+def first_end(
+    edges: HandEdges, spheres: Array, settings: VotingSettings
+) -> tuple[Cloud, ToolEnd] | None:
+    """Return what was voted and its first end as the voxels give it; None: there is none."""
+    cloud = reconstruct(edges, settings.voting)
+    shape = tool_shape(cloud, spheres, edges.reach, settings.end)
+    ends = far_voxels(shape, settings.end)
+    if not len(ends):
+        return None
+    return cloud, locate_end(cloud, shape, shape.voxels[ends[0]], spheres, settings.end)
+
+
 def _candidate(
+    edges: HandEdges,
     cloud: Cloud,
     shape: Shape,
     far: Array,
     spheres: Array,
-    reach: float,
     settings: VotingSettings,
 ) -> Candidate:
+    """Return the end that a far voxel (3,) lies on, put right by the images where they agree."""
     end = locate_end(cloud, shape, far, spheres, settings.end)
-    covariance = _covariance(cloud, end, far, spheres, reach, settings)
-    return Candidate(end.position, end.support, covariance, end.axis)
+    refined = refine_end(
+        edges, cloud, end.position, end.axis, end.radius, settings.refine, settings.trust.seed
+    )
+    if refined is None:
+        covariance = _voted_covariance(cloud, end, far, spheres, edges.reach, settings)
+        return Candidate(end.position, end.support, covariance, end.axis)
+    covariance, axis_variance = _uncertainty(refined, settings.trust)
+    return Candidate(refined.position, end.support, covariance, refined.axis, axis_variance**0.5)
 
 
-def _covariance(
+def _uncertainty(end: RefinedEnd, trust: TrustParams) -> tuple[Array, float]:
+    """Return (3, 3) m^2 and rad^2: chance, and a floor for what all frames have in common.
+
+    Calibration, motion blur and a shape that is not quite what the equations say are in every
+    frame. The last shows: fewer frames agree.
+    """
+    floor = max(trust.floor, trust.floor_px / end.pixels_per_metre)
+    doubt = 1.0 + trust.disagreement * max(trust.full_agreement - end.agreement, 0.0)
+    covariance: Array = end.position_covariance + (floor * doubt) ** 2 * np.eye(3)
+    return covariance, end.axis_variance + np.radians(trust.axis_floor_deg * doubt) ** 2
+
+
+def _voted_covariance(
     cloud: Cloud,
     end: ToolEnd,
     far: Array,
@@ -117,7 +149,7 @@ def _covariance(
         found = _end_near(part, far, spheres, reach, settings.end)
         if found is not None:
             deviations.append(found - end.position)
-    floor = (trust.floor + trust.floor_per_radius * end.radius) ** 2 * np.eye(3)
+    floor = (trust.voted_floor + trust.voted_floor_per_radius * end.radius) ** 2 * np.eye(3)
     if not deviations:
         return floor
     scatter = np.array(deviations)

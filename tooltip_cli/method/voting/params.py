@@ -80,6 +80,55 @@ class EndParams:
 
 
 @dataclass(frozen=True)
+class RefineParams:
+    """How an end is put right by the edges of every image; lengths in metres.
+
+    Where a length and one in pixels are given, the larger of the two holds at the tool's depth.
+    """
+
+    reach: float = 0.05  # how far back from the end edges are looked at
+    beyond: float = 0.03  # how far beyond it
+    max_move: float = 0.012  # from the voted end; what moves farther has found something else
+    min_ratio: float = 0.5  # log-likelihood ratio, at the tool's depth, of an edge that counts
+    min_sine: float = 0.35  # of the angle between axis and line of sight
+    min_sine_at_end: float = 0.5  # the same, where the end's own sides are looked at
+    min_edges: int = 5  # in a stretch, for it to have sides
+    side_quantile: float = 0.03  # what lies farther out does not make a side
+    end_slab: float = 0.005  # the last stretch, whose middle is the tip
+    end_slab_px: float = 4.0
+    loss_px: float = 1.0  # scale of the robust loss
+    first_loss_px: float = 4.0  # the same at first
+    missed_weight: float = 0.2  # of a side that lies too far inside: edges are missed, not made up
+    side_weight: float = 0.25  # of a side alone, against the middle between two
+    odd_width: float = 0.003  # that half a width differs by where a side was missed
+    prior_weight: float = 0.01  # of what decides where frames do not, for each frame
+    rounds: int = 10  # of looking again from where the end is now
+    point_share: float = 0.73  # of the frames whose farthest edges meet, at a pointed end
+    point_tolerance: float = 0.002  # within which they meet
+    point_tolerance_px: float = 2.5
+    point_width: float = 0.006  # across, that is looked at about a pointed end at first
+    start_turn_deg: float = 29.0  # of the other axes that are tried where the first one fails
+    good_agreement: float = 0.5  # share of frames that fit, above which no other axis is tried
+    min_agreement: float = 0.35  # below this, the voted end is kept
+    min_frames: int = 20  # that show the end
+    resamplings: int = 30  # of the frames, for the uncertainty
+
+
+@dataclass(frozen=True)
+class CalibrationParams:
+    """What corrections of clocks and camera are expected, and when one is made."""
+
+    time_prior: float = 0.03  # seconds, standard deviation of the clocks' offset
+    rotation_prior_deg: float = 1.0  # of the camera about each axis
+    translation_prior: float = 0.005  # metres, of the camera along each axis
+    rounds: int = 10
+    settled: float = 0.003  # of those deviations, smallest step worth another round
+    certain: float = 3.0  # standard deviations that an offset must have to be used
+    camera_gain: float = 0.05  # share of frames that must fit besides, for a camera's correction
+    determined: float = 0.33  # of those deviations, largest that still determines a direction
+
+
+@dataclass(frozen=True)
 class TrustParams:
     """When an answer is refused, and how uncertain one is at least."""
 
@@ -90,8 +139,13 @@ class TrustParams:
     min_in_view: float = 0.5  # share of the frames in which the tip lies inside the image
     halves: int = 6  # random halves of the frames that the end is found from again
     seed: int = 0  # of the halves
-    floor: float = 0.0015  # metres, standard deviation that no number of frames removes
-    floor_per_radius: float = 0.1  # the same, for each metre of the end's radius
+    voted_floor: float = 0.0015  # metres, standard deviation of a voted end, at least
+    voted_floor_per_radius: float = 0.1  # the same, for each metre of the end's radius
+    floor: float = 0.0005  # metres, standard deviation that no number of frames removes
+    floor_px: float = 1.0  # the same in pixels; the larger holds
+    full_agreement: float = 0.8  # below this share of frames that fit, the floor rises
+    disagreement: float = 15.0  # by this factor for the whole share
+    axis_floor_deg: float = 3.0  # standard deviation of the axis, at least
 
 
 @dataclass(frozen=True)
@@ -102,4 +156,6 @@ class VotingSettings:
     moving: MovingParams = field(default_factory=MovingParams)
     voting: VotingParams = field(default_factory=VotingParams)
     end: EndParams = field(default_factory=EndParams)
+    refine: RefineParams = field(default_factory=RefineParams)
+    calibration: CalibrationParams = field(default_factory=CalibrationParams)
     trust: TrustParams = field(default_factory=TrustParams)

@@ -49,6 +49,10 @@ class Cloud:
     step: float  # metres, of ``expected``
     score: float  # best share of expected frames that any coarse voxel was seen in
     consistent: float  # share of the moving edges that belong to something fixed to the hand
+    edges: Array  # (K, 2) normalized coordinates of all edges that may be fixed to the hand
+    edge_rows: Indices  # (K,) row of the chosen frames
+    profiles: npt.NDArray[np.float32]  # (K, depths) their log-likelihood ratios over depth
+    depths: Array  # (F, 3) first depth and step of each frame's profiles, metres; focal length
 
 
 def reconstruct(edges: HandEdges, params: VotingParams) -> Cloud:
@@ -85,6 +89,10 @@ def reconstruct(edges: HandEdges, params: VotingParams) -> Cloud:
         params.coarse,
         score,
         consistent,
+        points,
+        rows,
+        profiles,
+        depths,
     )
 
 

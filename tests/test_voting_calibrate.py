@@ -1,0 +1,124 @@
+"""Clocks and cameras that are wrong by known amounts, found from outlines drawn exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.helpers.scenes import FOCAL, poses_of
+from tests.test_voting_refine import AXIS, FRAMES, TIP, seen
+from tooltip_cli.method.types import Correction
+from tooltip_cli.method.voting.calibrate import Seen, calibrate
+from tooltip_cli.method.voting.params import CalibrationParams, RefineParams
+from tooltip_cli.method.voting.sight import near_edges
+from tooltip_cli.rig.kinematics import Mount
+
+Array = npt.NDArray[np.float64]
+
+PARAMS, REFINE = CalibrationParams(), RefineParams()
+TURN, STEP = np.array([0.010, -0.012, 0.008]), np.array([0.003, -0.003, 0.002])
+
+
+def poses_at(offset: float, seed: int) -> Array:
+    """Return smooth motion at 15 Hz, some 60 degrees about each axis, shifted by an offset."""
+    rng = np.random.default_rng(seed)
+    times = np.arange(FRAMES) / 15 + offset
+    angles = np.zeros((FRAMES, 3))
+    for _ in range(3):
+        rate, phase = rng.uniform(0.8, 2.5, 3), rng.uniform(0, 6, 3)
+        angles += 0.35 * np.sin(rate * times[:, None] + phase)
+    return poses_of(angles)
+
+
+def recording(offset: float, correction: Correction, seed: int) -> Seen:
+    """Return a bar seen by a camera that is off, with stamps that are late by an offset."""
+    true_poses = correction.corrected_from_camera @ poses_at(offset, seed)
+    hand, cloud = seen([(TIP, AXIS, 0.006, 0.006)], seed, views=true_poses)
+    said = replace(hand, camera_from_hand=poses_at(0.0, seed))
+    near = near_edges(said, cloud, TIP, REFINE)
+    return Seen(near, lambda shift: poses_at(shift, seed), TIP, AXIS, 0.006)
+
+
+def mean_error_px(one: Seen, found: Correction, truth: Correction, offset: float) -> float:
+    """Return how far the true tip projects from where it is seen, by the found correction."""
+    pixels = []
+    for correction, shift in ((found, found.time_offset), (truth, offset)):
+        at = correction.corrected_from_camera @ one.poses_at(shift) @ np.array([*TIP, 1.0])
+        pixels.append(FOCAL * at[:, :2] / at[:, 2:3])
+    return float(np.linalg.norm(pixels[0] - pixels[1], axis=1).mean())
+
+
+@pytest.mark.parametrize("offset", [-0.03, 0.0, 0.012, 0.03])
+def test_a_clock_offset_is_found(offset: float) -> None:
+    found = calibrate([recording(offset, Correction(), 3)], False, PARAMS, REFINE)
+    assert found is not None
+    assert found.correction.time_offset == pytest.approx(offset, abs=0.0015)
+    assert found.correction.rotation is None
+    assert found.applied == (offset != 0.0)
+    assert 0 < found.deviations[0] < 0.002
+
+
+def test_a_clock_offset_shared_by_two_recordings() -> None:
+    both = [recording(0.02, Correction(), seed) for seed in (4, 5)]
+    one = calibrate(both[:1], False, PARAMS, REFINE)
+    two = calibrate(both, False, PARAMS, REFINE)
+    assert one is not None
+    assert two is not None
+    assert two.correction.time_offset == pytest.approx(0.02, abs=0.001)
+    assert two.deviations[0] < one.deviations[0]
+
+
+def test_a_camera_that_is_off_is_put_right() -> None:
+    truth = Correction(0.02, TURN, STEP)
+    one = recording(0.02, truth, 6)
+    found = calibrate([one], True, PARAMS, REFINE)
+    assert found is not None
+    assert found.applied
+    assert found.correction.rotation is not None
+    assert found.correction.time_offset == pytest.approx(0.02, abs=0.0015)
+    assert found.support_after > found.support_before + PARAMS.camera_gain
+    before = mean_error_px(one, Correction(), truth, 0.02)
+    assert mean_error_px(one, found.correction, truth, 0.02) < 0.4 * before
+
+
+def test_a_camera_that_is_right_is_left_alone() -> None:
+    found = calibrate([recording(0.0, Correction(), 7)], True, PARAMS, REFINE)
+    assert found is not None
+    assert found.correction.rotation is None
+    assert not found.applied
+
+
+def test_no_end_is_no_calibration() -> None:
+    one = recording(0.0, Correction(), 8)
+    assert calibrate([replace(one, position=-TIP)], True, PARAMS, REFINE) is None
+
+
+numbers = st.floats(-3.0, 3.0)
+
+
+@given(st.lists(numbers, min_size=3, max_size=3), st.lists(numbers, min_size=3, max_size=3))
+def test_a_correction_is_a_rigid_motion(rotation: list[float], translation: list[float]) -> None:
+    forth = Correction(0.0, np.array(rotation), np.array(translation)).corrected_from_camera
+    turned = forth[:3, :3]
+    np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(turned) == pytest.approx(1.0)
+    angle = np.linalg.norm(rotation)
+    assert np.trace(turned) == pytest.approx(1.0 + 2.0 * np.cos(angle), abs=1e-9)
+    np.testing.assert_allclose(turned @ rotation, rotation, atol=1e-9)
+
+
+@given(
+    st.tuples(numbers, st.sampled_from([-np.pi / 2, np.pi / 2]) | st.floats(-1.5, 1.5), numbers),
+    st.tuples(numbers, numbers, numbers),
+)
+def test_a_mount_at_a_pose_has_that_pose(
+    rpy: tuple[float, float, float], xyz: tuple[float, float, float]
+) -> None:
+    pose = Mount("base", xyz, rpy).parent_from_camera
+    again = Mount.at("base", pose).parent_from_camera
+    np.testing.assert_allclose(again, pose, atol=1e-7)

@@ -1,0 +1,365 @@
+"""The end again, from the images: robust least squares over where it stops and where its sides are.
+
+Voxels are some millimetres wide, and so is what they say. Here the end that was found in them is
+put right by what each frame shows of it. With D and T the directions in the hand frame that move
+the end's image along and across the image of its axis, u = B^T D and w = B^T T their parts across
+the axis, d the step from the voted end to the tip, and A, A_s 2x2 matrices that stand for elliptic
+outlines of the end and of each slab s behind it:
+
+    stop       = D d + |A^T u|
+    side       = +-T (d or the midline at s) + |A_s^T w|
+    middle     =   T (d or the midline at s)
+
+The midline (an offset and a turn of the axis) is free of d: a plug's longest pin is not in line
+with its body. All is measured again from where the end then is, until it stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tooltip_cli.method.types import Array, Indices
+from tooltip_cli.method.voting.params import RefineParams
+from tooltip_cli.method.voting.sight import (
+    Measured,
+    NearEdges,
+    Sight,
+    across_axis,
+    measure,
+    near_edges,
+    point_of,
+    see,
+)
+from tooltip_cli.method.voting.volume import Cloud, HandEdges
+
+SLABS = ((-0.010, 0.0), (-0.018, -0.010), (-0.026, -0.018))  # metres, behind the end's own
+BEYOND_END = 0.003  # metres that the end's own slab reaches beyond it
+_FIRST_END_SLAB = 0.010  # metres, shrinking by
+_END_SLAB_STEP = 0.002  # in each round
+_LEAST_WIDTH = 0.010  # metres across, looked at about the thinnest tools
+_WIDTH_PER_RADIUS, _WIDTH_MARGIN = 1.8, 0.004
+_END_MARGIN = 0.002  # metres beyond the end's sides
+_MAX_STEP, _MAX_TURN = 0.005, 0.2  # metres and radians in one round
+_WIDE_ROUNDS = 2  # before the width at the end follows what was measured
+_SETTLED = 5e-5  # metres
+_SOLVER_STEPS = 8
+_STOP, _MIDDLE, SIDE = 0, 1, 2  # kinds of equations
+LINE = 7  # unknowns before the outlines: step (3), offset (2) and turn (2) of the midline
+_TINY = 1e-8  # m^2, keeps the root of no width differentiable
+# metres and radians, standard deviations of what is expected before the frames are looked at
+_STEP_PRIOR, _OFFSET_PRIOR, _TURN_PRIOR, _RADIUS_PRIOR, _TAPER_PRIOR = (
+    0.004, 0.010, 0.15, 0.006, 0.004,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RefinedEnd:
+    """Position and axis of an end, and how well the frames agree on them."""
+
+    position: Array  # (3,) metres, hand frame
+    axis: Array  # (3,) unit vector, hand frame
+    position_covariance: Array  # (3, 3) m^2, of chance alone
+    axis_variance: float  # rad^2 in each direction across it, of chance alone
+    agreement: float  # share of the frames' stops and middles that fit
+    pixels_per_metre: float  # at the end, median over the frames
+
+
+@dataclass(frozen=True)
+class System:
+    """What was measured, as equations: linear in all unknowns but the outlines."""
+
+    basis: Array  # (3, 2) across the axis
+    targets: Array  # (R,) metres
+    linear: Array  # (R, 7) derivatives by step, offset and turn
+    seen_along: Array  # (R, 2) direction that an outline is seen along
+    outline: Indices  # (R,) which one, or -1
+    kinds: Indices  # (R,)
+    frames: Indices  # (R,)
+    towards: Array  # (R, 3) hand frame: moving what is seen along it raises the target
+    places: Array  # (R,) metres along the axis from the end, of what is seen
+    prior: Array  # (P, unknowns)
+    prior_targets: Array  # (P,)
+
+
+def refine_end(
+    edges: HandEdges,
+    cloud: Cloud,
+    position: Array,
+    axis: Array,
+    radius: float,
+    params: RefineParams,
+    seed: int,
+) -> RefinedEnd | None:
+    """Put a voted end right, or return None where too few frames agree.
+
+    Where the voted axis leads nowhere, axes about it are tried, and what most frames agree on is
+    taken. Once the axis is known, so is whether one thing beside it reaches farther.
+
+    Args:
+        position: (3,) metres, hand frame; ``axis``: (3,) unit vector; ``radius``: metres.
+        seed: of the resampling.
+    """
+    found = best_fit(near_edges(edges, cloud, position, params), position, axis, radius, params)
+    return None if found is None else _resampled(found, params, seed)
+
+
+def best_fit(
+    near: NearEdges, position: Array, axis: Array, radius: float, params: RefineParams
+) -> Fit | None:
+    """Fit from the voted axis, from others where it leads nowhere, and at a point if it is one."""
+    best = fit_end(near, position, axis, radius, params)
+    if best is None or best.agreement(params) < params.good_agreement:
+        turned = [
+            fit_end(near, position, start, radius, params)
+            for start in _about(axis, params.start_turn_deg)
+        ]
+        fits = [fit for fit in (best, *turned) if fit is not None]
+        best = max(fits, key=lambda fit: fit.support(params), default=None)
+    if best is None or best.agreement(params) < params.min_agreement:
+        return None
+    point = point_of(near, best.position, best.axis, looked_at(radius), params)
+    if point is None:
+        return best
+    at_point = best.position + point
+    pointed = fit_end(near, at_point, best.axis, radius, params, params.point_width)
+    return best if pointed is None or pointed.agreement(params) < params.min_agreement else pointed
+
+
+def looked_at(radius: float) -> float:
+    """Return how far across the axis edges are looked at, metres."""
+    return max(_WIDTH_PER_RADIUS * radius + _WIDTH_MARGIN, _LEAST_WIDTH)
+
+
+def _about(axis: Array, degrees: float) -> Array:
+    """Return (6, 3) unit vectors at an angle to an axis (3,), evenly round it."""
+    turns = np.arange(6) * np.pi / 3
+    basis = across_axis(axis)
+    ring = np.cos(turns)[:, None] * basis[:, 0] + np.sin(turns)[:, None] * basis[:, 1]
+    angle = np.radians(degrees)
+    return np.asarray(np.cos(angle) * axis + np.sin(angle) * ring)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The equations where the end stays, and their solution."""
+
+    system: System
+    unknowns: Array
+    loss: float  # metres, scale of the robust loss
+    position: Array  # (3,) metres, hand frame
+    axis: Array  # (3,) unit vector, hand frame
+    pixels_per_metre: float
+    end_width: float  # metres across, that was looked at
+    pointed: bool  # whether that is one thing beside others
+
+    frames: int  # that were looked at
+
+    def agreement(self, params: RefineParams) -> float:
+        """Return the share of the frames' stops and middles that fit."""
+        return float(np.mean(self._told(params) < 2.0))
+
+    def support(self, params: RefineParams) -> float:
+        """Return how well they fit, over how many there could be: little shown supports little."""
+        close = 1.0 / (1.0 + np.square(self._told(params)))
+        return float(close.sum() / (self.frames * (len(SLABS) + 2)))
+
+    def _told(self, params: RefineParams) -> Array:
+        """Return the stops' and middles' residuals in units of the robust loss."""
+        residuals, _ = residuals_of(self.system, self.unknowns)
+        told = np.abs(residuals[self.system.kinds != SIDE])
+        return np.asarray(told * self.pixels_per_metre / params.loss_px)
+
+
+def fit_end(
+    near: NearEdges,
+    start: Array,
+    axis: Array,
+    radius: float,
+    params: RefineParams,
+    end_width: float | None = None,
+) -> Fit | None:
+    """Measure and solve until the end stays; None: too few frames, or it went elsewhere.
+
+    Args:
+        end_width: across, that is looked at about a pointed end; None: an end as any.
+    """
+    pixels = near.scale_at(start)
+    pointed, width, at = end_width is not None, looked_at(radius), start
+    end_width = width if end_width is None else end_width
+    thinnest = max(params.end_slab, params.end_slab_px / pixels)
+    loss, last_loss = params.first_loss_px / pixels, params.loss_px / pixels
+    outlines = np.tile([0.8 * radius, 0.0, 0.8 * radius], len(SLABS) + 2)
+    for index in range(params.rounds):
+        last = thinnest if pointed else _FIRST_END_SLAB - _END_SLAB_STEP * index
+        slabs = np.array([(-max(last, thinnest), BEYOND_END), *SLABS])
+        sight = see(near, at, axis)
+        measured = measure(near, sight, slabs, width, end_width, params)
+        if np.isfinite(measured.stops).sum() < params.min_frames:
+            return None
+        system = equations(sight, measured, slabs, axis, radius, params)
+        unknowns = solve(
+            system, np.concatenate([np.zeros(LINE), outlines]), loss, params, _SOLVER_STEPS
+        )
+        step, turn, outlines = unknowns[:3], system.basis @ unknowns[5:LINE], unknowns[LINE:]
+        at = at + _at_most(step, _MAX_STEP)
+        axis = axis + _at_most(turn, _MAX_TURN)
+        axis = axis / np.linalg.norm(axis)
+        end_width = _next_width(measured.halves[:, 0], end_width, width, pointed, index, params)
+        if np.linalg.norm(step) < _SETTLED and loss <= last_loss:
+            break
+        loss = max(0.6 * loss, last_loss)
+    if np.linalg.norm(at - start) > params.max_move:
+        return None
+    return Fit(system, unknowns, loss, at, axis, pixels, end_width, pointed, len(sight.scale))
+
+
+def _next_width(
+    halves: Array, now: float, width: float, pointed: bool, index: int, params: RefineParams
+) -> float:
+    """Return how far across the end's own slab is looked at in the next round, metres."""
+    if not np.isfinite(halves).any():
+        return now
+    if pointed:  # as far as one thing goes: what stands beside a pin is left out
+        return min(width, max(float(np.nanmedian(halves)) + _END_MARGIN, params.point_width))
+    if index < _WIDE_ROUNDS:
+        return now
+    return min(width, 2.0 * float(np.nanquantile(halves, 0.9)) + _END_MARGIN)
+
+
+def _at_most(vector: Array, length: float) -> Array:
+    return vector * min(1.0, length / max(float(np.linalg.norm(vector)), 1e-12))
+
+
+def _resampled(fit: Fit, params: RefineParams, seed: int) -> RefinedEnd:
+    """Resample the frames (bootstrap) for the uncertainty."""
+    system, unknowns = fit.system, fit.unknowns
+    rng = np.random.default_rng(seed)
+    frames = int(system.frames.max()) + 1
+    samples = np.empty((params.resamplings, LINE))
+    for row in samples:
+        drawn = np.bincount(rng.integers(0, frames, frames), minlength=frames).astype(float)
+        row[:] = (solve(system, unknowns, fit.loss, params, 2, drawn) - unknowns)[:LINE]
+    return RefinedEnd(
+        fit.position,
+        fit.axis,
+        samples[:, :3].T @ samples[:, :3] / len(samples),
+        float(np.square(samples[:, 5:]).mean()),
+        fit.agreement(params),
+        fit.pixels_per_metre,
+    )
+
+
+def equations(
+    sight: Sight,
+    measured: Measured,
+    slabs: Array,
+    axis: Array,
+    radius: float,
+    params: RefineParams,
+) -> System:
+    basis = across_axis(axis)
+    stopped = np.flatnonzero(np.isfinite(measured.stops))
+    frame, slab = np.nonzero(np.isfinite(measured.middles))
+    stop_rows = sight.stop_direction[stopped]
+    side_rows = sight.side_direction[frame]
+    across = side_rows @ basis
+    own = (slab == 0)[:, None]  # the end itself is where the step leads; the rest is the midline
+    place = np.minimum(slabs, 0.0).mean(axis=1)[slab][:, None]
+    midline = np.where(own, 0.0, np.hstack([across, place * across]))
+    lines = np.hstack([np.where(own, side_rows, 0.0), midline])
+    middle, half = measured.middles[frame, slab], measured.halves[frame, slab]
+    outlines = len(slabs) + 1
+    prior, prior_targets = _prior(outlines, radius, len(stopped) + len(frame), params)
+    return System(
+        basis,
+        np.concatenate([measured.stops[stopped], middle, half + middle, half - middle]),
+        np.concatenate([np.pad(stop_rows, ((0, 0), (0, 4))), lines, lines, -lines]),
+        np.concatenate([stop_rows @ basis, across, across, across]),
+        np.concatenate([np.zeros_like(stopped), np.full_like(slab, -1), 1 + slab, 1 + slab]),
+        np.repeat([_STOP, _MIDDLE, SIDE], [len(stopped), len(frame), 2 * len(frame)]),
+        np.concatenate([stopped, frame, frame, frame]),
+        np.concatenate([stop_rows, side_rows, side_rows, -side_rows]),
+        np.concatenate([np.zeros(len(stopped)), *[np.where(own, 0.0, place)[:, 0]] * 3]),
+        prior,
+        prior_targets,
+    )
+
+
+def _prior(outlines: int, radius: float, count: int, params: RefineParams) -> tuple[Array, Array]:
+    """Return weak equations that decide what frames leave open: rows, and what they should give."""
+    unknowns = LINE + 3 * outlines
+    sigmas = np.repeat(
+        [_STEP_PRIOR, _OFFSET_PRIOR, _TURN_PRIOR, _RADIUS_PRIOR, _TAPER_PRIOR],
+        [3, 2, 2, 3, 3 * (outlines - 1)],
+    )
+    rows = np.eye(unknowns)
+    for column in range(LINE + 3, unknowns):  # neighbouring outlines are alike
+        rows[column, column - 3] = -1.0
+    targets = np.zeros(unknowns)
+    targets[[LINE, LINE + 2]] = radius
+    weights = params.prior_weight * np.sqrt(count) / sigmas
+    return rows * weights[:, None], targets * weights
+
+
+def residuals_of(system: System, unknowns: Array) -> tuple[Array, Array]:
+    """Return (R,) residuals, metres, and (R, unknowns) the model's derivatives."""
+    root = unknowns[LINE:].reshape(-1, 3)[system.outline]  # lower triangles
+    u, w = system.seen_along.T
+    first, second = root[:, 0] * u + root[:, 1] * w, root[:, 2] * w
+    width = np.sqrt(first * first + second * second + _TINY)
+    has = system.outline >= 0
+    derivatives = np.zeros((len(u), len(unknowns)))
+    derivatives[:, :LINE] = system.linear
+    rows = np.flatnonzero(has)
+    for offset, part in enumerate((first * u, first * w, second * w)):
+        derivatives[rows, LINE + 3 * system.outline[rows] + offset] = (part / width)[rows]
+    residuals = system.targets - system.linear @ unknowns[:LINE] - np.where(has, width, 0.0)
+    return residuals, derivatives
+
+
+def solve(
+    system: System,
+    unknowns: Array,
+    loss: float,
+    params: RefineParams,
+    steps: int,
+    frame_weights: Array | None = None,
+) -> Array:
+    """Return the unknowns after Gauss-Newton steps with Cauchy weights.
+
+    Args:
+        loss: scale of the robust loss, metres.
+        frame_weights: (F,) how often each frame counts.
+    """
+    for _ in range(steps):
+        residuals, derivatives = residuals_of(system, unknowns)
+        weighted = (
+            derivatives * robust_weights(system, residuals, loss, params, frame_weights)[:, None]
+        )
+        normal = weighted.T @ derivatives + system.prior.T @ system.prior
+        right = weighted.T @ residuals + system.prior.T @ (
+            system.prior_targets - system.prior @ unknowns
+        )
+        unknowns = unknowns + np.linalg.solve(normal + 1e-9 * np.eye(len(normal)), right)
+    return unknowns
+
+
+def robust_weights(
+    system: System,
+    residuals: Array,
+    loss: float,
+    params: RefineParams,
+    frame_weights: Array | None = None,
+) -> Array:
+    """Return (R,) Cauchy weights of residuals (R,), metres."""
+    side, middle = system.kinds == SIDE, system.kinds == _MIDDLE
+    weights = np.where(side, params.side_weight, 1.0) / (loss**2 + np.square(residuals))
+    if frame_weights is not None:
+        weights *= frame_weights[system.frames]
+    weights[side & (residuals < 0)] *= params.missed_weight
+    # where one side was missed, half the width is too small and the middle says nothing
+    odd = residuals[side].reshape(2, -1).mean(axis=0) / params.odd_width
+    weights[middle] /= np.square(1.0 + odd * odd)
+    return np.asarray(weights)
