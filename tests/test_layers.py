@@ -34,6 +34,7 @@ FREE = {"errors", "resources", ""}
 HEAVY = (
     "av",
     "cv2",
+    "cyclonedds",
     "matplotlib",
     "numba",
     "numpy",

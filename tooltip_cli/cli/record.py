@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tooltip_cli.cli.options import PATH, jobs_option, progress, say, topic_options
-from tooltip_cli.cli.record_live import camera
+from tooltip_cli.cli.record_live import camera, ros2
 from tooltip_cli.cli.recording import (
     finish,
     load_rig_file,
@@ -40,10 +40,12 @@ def record() -> None:
       tooltip record lerobot datasets/g1 can.mcap --episode 1
       tooltip record video pliers.mp4 pliers.mcap --joints joints.csv --rig rig.yaml
       tooltip record camera pliers.mcap --camera 0 --joints udp://:9870 --rig rig.yaml
+      tooltip record ros2 pliers.mcap --duration 15 --rig rig.yaml
     """
 
 
 record.add_command(camera)
+record.add_command(ros2)
 
 
 @record.command("sim", short_help="Simulate a robot that sweeps a tool.")

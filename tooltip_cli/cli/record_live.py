@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
-from tooltip_cli.cli.options import printable, say, size_in_bytes
+from tooltip_cli.cli.options import printable, say, size_in_bytes, topic_options
 from tooltip_cli.cli.recording import (
     finish,
     load_rig_file,
@@ -135,6 +135,61 @@ def camera(
         rig=load_rig_file(rig),
         urdf=load_urdf(robot),
     )
+    options = LiveOptions(duration, until_enough, reconnect, patience, queue, min_free)
+    _record(source, out, options, force, as_json)
+
+
+@click.command("ros2", short_help="Record a ROS 2 robot, without ROS.")
+@out_argument
+@topic_options
+@click.option(
+    "--domain",
+    type=click.IntRange(0, 232),
+    default=0,
+    show_default=True,
+    envvar="ROS_DOMAIN_ID",
+    show_envvar=True,
+    metavar="N",
+    help="DDS domain of the robot.",
+)
+@live_options
+@rig_options
+@result_options
+def ros2(
+    out: Path,
+    image: str | None,
+    joints: str | None,
+    info: str | None,
+    pose: str | None,
+    domain: int,
+    duration: float | None,
+    until_enough: bool,
+    reconnect: bool,
+    patience: float,
+    queue: int,
+    rig: Path | None,
+    robot: Path | None,
+    min_free: int,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Record images, intrinsics, joints and robot description of a ROS 2 robot over DDS.
+
+    No ROS is needed on this machine. Messages are stored byte for byte, with the time of their
+    arrival and that of their publication. A topic that is named may begin later; of the others,
+    the only one of its type that is heard within three seconds is taken.
+
+    \b
+    Examples:
+      tooltip record ros2 pliers.mcap --duration 15 --rig rig.yaml
+      tooltip record ros2 pliers.mcap --image /head/image_raw/compressed --domain 7
+    """
+    from tooltip_cli.log.recording import Topics
+    from tooltip_cli.sources.ros2 import Ros2Source
+    from tooltip_cli.stages.live import LiveOptions
+
+    topics = Topics(image, joints, info, pose)
+    source = Ros2Source(domain, topics, load_rig_file(rig), load_urdf(robot))
     options = LiveOptions(duration, until_enough, reconnect, patience, queue, min_free)
     _record(source, out, options, force, as_json)
 
