@@ -19,7 +19,7 @@ import pytest
 
 from tests.helpers.cli import tooltip
 from tests.helpers.live import MjpegServer, free_port, joint_line, udp_joints
-from tests.helpers.logs import jpeg_of
+from tests.helpers.logs import FRAME_NS, START_NS, angles, jpeg_of
 from tests.helpers.robot import JOINTS, RIG
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.log.container import LoggedMessage, iterate
@@ -228,6 +228,31 @@ def test_stamps_of_another_clock_are_pointed_out(tmp_path: Path, server: MjpegSe
     time.sleep(0.3)
     _, _, err = recording.end(signal.SIGINT)
     assert err.count("give --joint-stamps arrival") == 1
+
+
+def test_until_enough_ends_by_itself(tmp_path: Path, server: MjpegServer) -> None:
+    port = free_port(socket.SOCK_DGRAM)
+    sources = ("--camera", server.url, "--joints", f"udp://127.0.0.1:{port}")
+    rig = write_rig(tmp_path)
+    recording = Recording(tmp_path / "out.mcap", *sources, "--rig", rig, "--until-enough", "--json")
+    assert server.connected.wait(30)
+    with udp_joints(port) as send:
+        for i in range(20_000):
+            if recording.process.poll() is not None:
+                break
+            # by number, not by time: no load of the machine makes the wrist faster
+            pitch, roll = angles(START_NS + i * FRAME_NS)
+            send(joint_line({JOINTS[0]: pitch, JOINTS[1]: roll}, None))
+            server.show(jpeg_of(0))
+            time.sleep(0.005)
+    code, out, err = recording.end()
+    assert code == 0, err
+    document = json.loads(out)
+    assert document["motion"]["verdict"] == "enough"
+    assert document["motion"]["frames"] == 200
+    assert "ended: the motion is enough" in document["notes"]
+    info = json.loads(tooltip("info", recording.out, "--json").out)
+    assert info["usable_frames"] * document["read"][IMAGES] >= 190
 
 
 def test_until_enough_needs_a_rig(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import signal
 import subprocess
 import sys
@@ -171,6 +172,21 @@ def test_a_publisher_that_is_killed_and_restarted_is_heard_again(
     assert payloads.count(on_the_wire(ros2_robot.image_payload("jpeg", 64, 48, 0))) >= 2
     assert f"nothing on {IMAGE} any more" in err
     assert f"{IMAGE} is heard again after" in err
+
+
+def test_list_shows_topics_types_and_rates(domain: int) -> None:
+    sender = robot(domain, "jpeg", 64, 48, 20, 100, 4)
+    done = tooltip("record", "list", "--domain", domain, "--json")
+    for _ in range(10):  # until the robot is up
+        if done.code == 0 and len(json.loads(done.out)) == 4:
+            break
+        done = tooltip("record", "list", "--domain", domain, "--json")
+    sender.communicate(timeout=90)
+    found = {item["topic"]: item for item in json.loads(done.out)}
+    assert set(found) == {IMAGE, INFO, STATES, ROBOT}
+    assert found[IMAGE]["type"] == messages.COMPRESSED_IMAGE
+    assert found[STATES]["hz"] > found[IMAGE]["hz"] > 1
+    assert found[ROBOT]["hz"] == 0
 
 
 def test_names_of_types_on_the_wire() -> None:

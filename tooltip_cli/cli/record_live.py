@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
-from tooltip_cli.cli.options import printable, say, size_in_bytes, topic_options
+from tooltip_cli.cli.options import (
+    json_option,
+    print_json,
+    printable,
+    say,
+    size_in_bytes,
+    table,
+    topic_options,
+)
 from tooltip_cli.cli.recording import (
     finish,
     load_rig_file,
@@ -192,6 +200,45 @@ def ros2(
     source = Ros2Source(domain, topics, load_rig_file(rig), load_urdf(robot))
     options = LiveOptions(duration, until_enough, reconnect, patience, queue, min_free)
     _record(source, out, options, force, as_json)
+
+
+@click.command("list", short_help="Show what can be heard.")
+@click.option(
+    "--domain",
+    type=click.IntRange(0, 232),
+    default=0,
+    show_default=True,
+    envvar="ROS_DOMAIN_ID",
+    show_envvar=True,
+    metavar="N",
+    help="DDS domain of the robot.",
+)
+@json_option
+def list_(domain: int, as_json: bool) -> None:
+    """Show the topics of a ROS 2 robot: names, types, rates.
+
+    Rates are measured over two seconds, for the types that a recording can hold.
+
+    \b
+    Examples:
+      tooltip record list
+      tooltip record list --domain 7 --json
+    """
+    from tooltip_cli.sources.ros2 import topic_rates
+
+    found = topic_rates(domain, 2.0)
+    if as_json:
+        print_json(
+            [{"topic": item.name, "type": item.datatype, "hz": rate} for item, rate in found]
+        )
+        return
+    if not found:
+        say(f"DDS domain {domain}: nothing is heard; is ROS_DOMAIN_ID the robot's?")
+    rows = [
+        (item.name, item.datatype, "-" if rate is None else f"{rate:.1f}") for item, rate in found
+    ]
+    for line in table(("topic", "type", "Hz"), rows, 2) if rows else ():
+        click.echo(line)
 
 
 def _record(

@@ -217,6 +217,41 @@ def open_domain(domain: int) -> Any:
         ) from error
 
 
+def topic_rates(domain: int, listen_s: float) -> list[tuple[HeardTopic, float | None]]:
+    """Return what is published in a domain, with messages a second where the type is known.
+
+    Raises:
+        MissingExtraError: cyclonedds is not installed.
+        TooltipError: the domain cannot be joined.
+    """
+    participant, halt, clock = open_domain(domain), threading.Event(), ArrivalClock()
+    heard = heard_topics(participant, DISCOVERY_S, halt)
+    arrivals: dict[str, list[int]] = {}
+
+    def count(message: Message) -> None:
+        arrivals.setdefault(message.topic, []).append(message.log_time_ns)
+
+    known = [topic for topic in heard if topic.datatype in _TYPES]
+    threads = [
+        threading.Thread(target=_Topic(participant, topic, clock).run, args=(count, halt))
+        for topic in known
+    ]
+    for thread in threads:
+        thread.start()
+    halt.wait(listen_s)
+    halt.set()
+    for thread in threads:
+        thread.join()
+    return [
+        (topic, _rate(arrivals.get(topic.name, [])) if topic in known else None) for topic in heard
+    ]
+
+
+def _rate(arrivals_ns: Sequence[int]) -> float:
+    spans = len(arrivals_ns) - 1
+    return spans * 1e9 / max(arrivals_ns[-1] - arrivals_ns[0], 1) if spans > 0 else 0.0
+
+
 class Ros2Source:
     """Images, intrinsics, joints or poses and the robot description of a ROS 2 robot.
 
