@@ -154,7 +154,7 @@ def test_silence_and_return_of_a_stream_are_told(tmp_path: Path) -> None:
         on_note=told.append,
     )
     assert told[0] == f"nothing on {JOINT_TOPIC} yet"
-    assert told[1].startswith(f"{JOINT_TOPIC} is heard again after ")
+    assert told[1].startswith(f"{JOINT_TOPIC} is heard after ")
     silent = {
         stream.silent for status in seen for stream in status.streams if "joint" in stream.topic
     }

@@ -313,13 +313,15 @@ def status_text(status: Status) -> str:
     parts = []
     verdict = status.verdict
     if verdict is not None:
-        parts.append(
-            f"{verdict.advice.upper()} {verdict.frames}/{verdict.wanted_frames} images, "
-            f"{verdict.view_deg:.0f} deg, {verdict.motion_px:.1f} px/image"
-        )
+        parts.append(verdict.advice.upper())
+        if verdict.frames or verdict.motion_px:
+            parts.append(
+                f"{verdict.frames}/{verdict.wanted_frames} images, {verdict.view_deg:.0f} deg, "
+                f"{verdict.motion_px:.1f} px/image"
+            )
     parts.append(f"{status.elapsed_s:.0f} s")
     for stream in status.streams:
-        if stream.rate_hz or stream.silent:
+        if stream.expected or stream.dropped:
             rate = "SILENT" if stream.silent else f"{stream.rate_hz:.0f} Hz"
             lost = f" ({stream.dropped} dropped)" if stream.dropped else ""
             parts.append(f"{stream.topic} {rate}{lost}")

@@ -50,6 +50,7 @@ class StreamStatus:
     dropped: int
     rate_hz: float  # over the last two seconds
     silent: bool  # nothing for a second
+    expected: bool  # images, joints or poses
 
 
 @dataclass(frozen=True)
@@ -265,15 +266,13 @@ class _Recorder:
 
     def _stream(self, topic: str, now: float, received: int, dropped: int) -> StreamStatus:
         heard = self._heard.setdefault(topic, _Heard())
+        expected = topic in self._source.expected_topics
         if received > heard.received:
             if heard.silent:
-                self.note(f"{topic} is heard again after {now - heard.since:.1f} s")
+                again = "again " if heard.received else ""
+                self.note(f"{topic} is heard {again}after {now - heard.since:.1f} s")
             heard.received, heard.since, heard.silent = received, now, False
-        elif (
-            now - heard.since > _SILENT_S
-            and topic in self._source.expected_topics
-            and not heard.silent
-        ):
+        elif expected and not heard.silent and now - heard.since > _SILENT_S:
             heard.silent = True
             self.note(f"nothing on {topic} " + ("yet" if not received else "any more"))
         heard.history.append((now, received))
@@ -281,4 +280,4 @@ class _Recorder:
             heard.history.popleft()
         before, count = heard.history[0]
         rate = (received - count) / (now - before) if now > before else 0.0
-        return StreamStatus(topic, received, dropped, rate, heard.silent)
+        return StreamStatus(topic, received, dropped, rate, heard.silent, expected)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import deque
 from typing import Any
@@ -12,15 +13,16 @@ from tooltip_cli.errors import TooltipError
 from tooltip_cli.log import messages
 from tooltip_cli.log.messages import Message, decode, header_stamp_ns, ns_from_time
 from tooltip_cli.log.recording import IMAGE_TYPES
-from tooltip_cli.log.sync import interpolate
-from tooltip_cli.log.views import MAX_GAP_NS
+from tooltip_cli.log.sync import interpolate, interpolate_poses
+from tooltip_cli.log.views import MAX_GAP_NS, Stamps
 from tooltip_cli.method.types import Array
 from tooltip_cli.method.voting.params import VotingSettings
 from tooltip_cli.method.voting.watching import MotionWatch, Verdict
 from tooltip_cli.rig.camera import CameraModel
-from tooltip_cli.rig.kinematics import KinematicChain, inverse_transform
+from tooltip_cli.rig.kinematics import KinematicChain, inverse_transform, rotation_from_quaternion
 from tooltip_cli.rig.rigfile import Rig
 
+_LOG = logging.getLogger(__name__)
 _JUDGE_EVERY_S = 1.0
 _SAMPLES = 4000  # of joints that are remembered: eight seconds at 500 Hz
 _PENDING = 120  # images that wait for the joints after them
@@ -43,35 +45,49 @@ class MotionObserver:
         self._chain: KinematicChain | None = None
         self._watch: MotionWatch | None = None
         self._stamps: deque[int] = deque(maxlen=_SAMPLES)
-        self._positions: deque[tuple[float, ...]] = deque(maxlen=_SAMPLES)
+        self._samples: deque[tuple[float, ...]] = deque(maxlen=_SAMPLES)  # joints, or a pose
         self._images: deque[int] = deque(maxlen=_PENDING)
         self._verdict: Verdict | None = None
         self._judged = 0.0
-        self.problem = ""  # why the motion cannot be judged
+        self._problem = ""
 
     def take(self, message: Message) -> None:
         """Read along; what cannot be used is left to later commands to complain about."""
-        if self.problem:
+        if self._problem:
             return
         try:
             self._take(message)
         except TooltipError as error:
-            self.problem = str(error)
+            self._problem = str(error)
         except Exception as error:  # the decoder meets arbitrary bytes
-            self.problem = f"{message.topic} carries no {message.datatype} ({error!r})"
+            self._problem = f"{message.topic} carries no {message.datatype} ({error!r})"
 
     @property
     def ample(self) -> bool:
         """Whether more motion would not be looked at."""
         return self._watch is not None and self._watch.ample
 
+    @property
+    def problem(self) -> str:
+        """Why the motion is not judged; empty where it is."""
+        if self._problem or self._watch is not None:
+            return self._problem
+        if self._camera is None:
+            return "no intrinsics, neither in the rig nor as CameraInfo"
+        return "no robot description or no image was heard"
+
     def verdict(self, *, now: bool = False) -> Verdict | None:
         """Return the verdict, a second old at most; None: nothing can be said yet."""
-        if self._watch is not None:
-            self._pass_images()
+        if self._watch is None or self._problem:
+            return self._verdict
+        try:
+            self._pass_images(self._watch)
             if now or time.monotonic() - self._judged > _JUDGE_EVERY_S:
                 self._verdict = self._watch.judge()
                 self._judged = time.monotonic()
+        except Exception as error:  # whatever numbers came: the recording goes on without a verdict
+            _LOG.warning("the motion is not judged any more", exc_info=True)
+            self._problem = repr(error)
         return self._verdict
 
     def _take(self, message: Message) -> None:
@@ -83,51 +99,72 @@ class MotionObserver:
                 self._image_frame = str(decode(message.datatype, message.payload).header.frame_id)
         elif message.datatype == messages.JOINT_STATE and self._chain is not None:
             self._take_joints(self._chain, decode(message.datatype, message.payload))
+        elif message.topic == self._rig.pose_topic:
+            self._take_pose(decode(message.datatype, message.payload))
         elif message.datatype == messages.CAMERA_INFO and self._camera is None:
             info = decode(message.datatype, message.payload)
             self._camera = messages.camera_from_info(info, message.topic)
         elif message.datatype == messages.STRING and self._urdf is None:
             self._urdf = str(decode(message.datatype, message.payload).data)
-        if self._chain is None:
+        if self._watch is None:
             self._prepare()
 
     def _prepare(self) -> None:
-        """Set up the chain once everything is known that it needs."""
-        frame = self._rig.camera_frame or self._image_frame
-        if self._urdf is None or self._camera is None or frame is None:
+        """Begin to watch once everything is known that it needs."""
+        rig, camera = self._rig, self._camera
+        if camera is None:
             return
-        rig = self._rig
-        self._chain = KinematicChain.from_urdf(
-            self._urdf, frame, rig.hand_frame, rig.mount, rig.source
-        )
-        focal_px = float(np.sqrt(self._camera.fx * self._camera.fy))
-        self._watch = MotionWatch(focal_px, VotingSettings())
+        if rig.pose_topic is None:
+            frame = rig.camera_frame or self._image_frame
+            if self._urdf is None or frame is None:
+                return
+            self._chain = KinematicChain.from_urdf(
+                self._urdf, frame, rig.hand_frame, rig.mount, rig.source
+            )
+        elif rig.mount is None:
+            raise TooltipError(f"{rig.source}: with hand.pose_topic the camera needs camera.mount")
+        self._watch = MotionWatch(float(np.sqrt(camera.fx * camera.fy)), VotingSettings())
 
     def _take_joints(self, chain: KinematicChain, state: Any) -> None:
         names = (self._rig.joints.get(name, name) for name in state.name)
         positions = dict(zip(names, state.position, strict=False))
-        stamp_ns = ns_from_time(state.header.stamp)
-        if not all(name in positions for name in chain.joint_names):
-            return
-        if self._stamps and stamp_ns <= self._stamps[-1]:
-            return
-        self._stamps.append(stamp_ns)
-        self._positions.append(tuple(float(positions[name]) for name in chain.joint_names))
+        if all(name in positions for name in chain.joint_names):
+            self._add(state, tuple(float(positions[name]) for name in chain.joint_names))
 
-    def _pass_images(self) -> None:
+    def _take_pose(self, message: Any) -> None:
+        place, turn = message.pose.position, message.pose.orientation
+        self._add(message, (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
+
+    def _add(self, message: Any, sample: tuple[float, ...]) -> None:
+        stamp_ns = ns_from_time(message.header.stamp)
+        if not self._stamps or stamp_ns > self._stamps[-1]:
+            self._stamps.append(stamp_ns)
+            self._samples.append(sample)
+
+    def _pass_images(self, watch: MotionWatch) -> None:
         """Hand on the pose at every image that lies before the latest joints."""
-        if not self._stamps or self._chain is None or self._watch is None:
-            return
         ready: list[int] = []
-        while self._images and self._images[0] <= self._stamps[-1]:
+        while self._stamps and self._images and self._images[0] <= self._stamps[-1]:
             ready.append(self._images.popleft())
         if not ready:
             return
-        stamps = np.array(self._stamps, dtype=np.int64)
         query = np.array(sorted(ready), dtype=np.int64)
-        joints = [
-            interpolate(stamps, track, query, MAX_GAP_NS) for track in np.array(self._positions).T
-        ]
-        poses: Array = inverse_transform(self._chain.hand_from_camera(np.stack(joints, axis=1)))
-        for stamp_ns, pose in zip(query, poses, strict=True):
-            self._watch.add(pose, int(stamp_ns) / 1e9)
+        for stamp_ns, pose in zip(query, self._camera_from_hand(query), strict=True):
+            watch.add(pose, int(stamp_ns) / 1e9)
+
+    def _camera_from_hand(self, query_ns: Stamps) -> Array:
+        """Return (N, 4, 4) at some times; NaN where it is unknown."""
+        stamps = np.array(self._stamps, dtype=np.int64)
+        samples = np.array(self._samples)
+        if self._chain is not None:
+            joints = [interpolate(stamps, track, query_ns, MAX_GAP_NS) for track in samples.T]
+            return inverse_transform(self._chain.hand_from_camera(np.stack(joints, axis=1)))
+        mount = self._rig.mount
+        assert mount is not None  # noqa: S101 - seen to by _prepare
+        positions, quaternions = interpolate_poses(
+            stamps, samples[:, :3], samples[:, 3:], query_ns, MAX_GAP_NS
+        )
+        base_from_hand = np.tile(np.eye(4), (len(query_ns), 1, 1))
+        base_from_hand[:, :3, :3] = rotation_from_quaternion(quaternions)
+        base_from_hand[:, :3, 3] = positions
+        return np.asarray(inverse_transform(mount.parent_from_camera) @ base_from_hand)
