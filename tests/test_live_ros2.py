@@ -189,6 +189,18 @@ def test_list_shows_topics_types_and_rates(domain: int) -> None:
     assert found[ROBOT]["hz"] == 0
 
 
+@pytest.mark.parametrize("command", [("ros2", "out.mcap"), ("list",)])
+def test_without_cyclonedds_the_extra_is_named(
+    command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.startswith("cyclonedds.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "cyclonedds", None)
+    done = tooltip("record", *command)
+    assert done.code == 1
+    assert "pip install 'tooltip-cli[ros2]'" in done.error
+
+
 def test_names_of_types_on_the_wire() -> None:
     assert dds_type_name(messages.JOINT_STATE) == "sensor_msgs::msg::dds_::JointState_"
     assert ros_type_name("sensor_msgs::msg::dds_::JointState_") == messages.JOINT_STATE

@@ -154,13 +154,15 @@ class _Recorder:
             self._threads.append(thread)
             thread.start()
         shown = 0.0
-        while not self._ended():
-            self._drain(writer, 0.05)
-            if time.monotonic() - shown > _STATUS_EVERY_S:
-                shown = time.monotonic()
-                self._tell_news()
-                self._on_status(self._status(writer, out))
-        self._halt.set()
+        try:
+            while not self._ended():
+                self._drain(writer, 0.05)
+                if time.monotonic() - shown > _STATUS_EVERY_S:
+                    shown = time.monotonic()
+                    self._tell_news()
+                    self._on_status(self._status(writer, out))
+        finally:
+            self._halt.set()
         for thread in self._threads:
             thread.join(_JOIN_S)
         while self._drain(writer, 0.0):
@@ -168,7 +170,6 @@ class _Recorder:
 
     def close(self) -> None:
         """Say what was lost and why it ended."""
-        self._halt.set()
         for topic, count in sorted(self._backlog.counts()[1].items()):
             reason = f"messages on {topic} that came faster than they could be written"
             self._source.report.dropped[reason] = count
