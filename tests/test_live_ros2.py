@@ -23,7 +23,7 @@ from tests.helpers.robot import URDF
 from tests.helpers.ros2_robot import IMAGE, INFO, RAW, ROBOT, STATES, Publisher
 from tooltip_cli.log import messages
 from tooltip_cli.log.container import LoggedMessage, iterate
-from tooltip_cli.sources.ros2 import dds_type_name, ros_type_name
+from tooltip_cli.sources.dds import dds_type_name, ros_type_name
 
 ROOT = Path(__file__).parents[1]
 _NUMBERS = itertools.count(30)

@@ -17,7 +17,7 @@ from cyclonedds.topic import Topic
 
 from tests.helpers.robot import CAMERA, CAMERA_FRAME, JOINTS, URDF
 from tooltip_cli.log import messages
-from tooltip_cli.sources.ros2 import dds_type
+from tooltip_cli.sources.dds import dds_type
 
 IMAGE, RAW, INFO = "/camera/image/compressed", "/camera/image_raw", "/camera/camera_info"
 STATES, ROBOT = "/joint_states", "/robot_description"

@@ -224,7 +224,7 @@ def list_(domain: int, as_json: bool) -> None:
       tooltip record list
       tooltip record list --domain 7 --json
     """
-    from tooltip_cli.sources.ros2 import topic_rates
+    from tooltip_cli.sources.dds import topic_rates
 
     found = topic_rates(domain, 2.0)
     if as_json:
