@@ -35,6 +35,7 @@ FREE = {"errors", "resources", "machine_code", ""}
 HEAVY = (
     "av",
     "cv2",
+    "cyclonedds",
     "dask",
     "distributed",
     "matplotlib",

@@ -1,62 +1,26 @@
-"""``tooltip record``: simulate, or import from bags, data sets and videos."""
+"""``tooltip record``: simulate, import from bags, data sets and videos, or listen to a robot."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from tooltip_cli.cli.options import (
-    PATH,
-    jobs_option,
-    print_json,
-    progress,
-    say,
-    size_in_bytes,
-    topic_options,
+from tooltip_cli.cli.options import PATH, jobs_option, progress, say, topic_options
+from tooltip_cli.cli.record_live import camera, list_, ros2
+from tooltip_cli.cli.recording import (
+    finish,
+    load_rig_file,
+    load_urdf,
+    out_argument,
+    result_options,
+    rig_options,
+    tell,
 )
 
 if TYPE_CHECKING:
-    from tooltip_cli.rig.rigfile import Rig
-    from tooltip_cli.sources.base import Source, SourceReport
-
-_Command = TypeVar("_Command", bound=Callable[..., Any])
-
-
-def _out_argument(command: _Command) -> _Command:
-    return click.argument("out", type=PATH, metavar="OUT.mcap")(command)
-
-
-def _result_options(command: _Command) -> _Command:
-    command = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")(
-        command
-    )
-    command = click.option(
-        "--min-free",
-        type=size_in_bytes,
-        default="100MB",
-        show_default=True,
-        metavar="SIZE",
-        help="Stop before the disk has less than this left.",
-    )(command)
-    return click.option("--force", is_flag=True, help="Replace OUT.mcap if it exists.")(command)
-
-
-def _rig_options(command: _Command) -> _Command:
-    command = click.option(
-        "--robot",
-        type=PATH,
-        metavar="URDF",
-        help="Robot description to store in the log, in place of any other.",
-    )(command)
-    return click.option(
-        "--rig",
-        type=PATH,
-        metavar="FILE",
-        help="Rig file to store in the log; later commands then need none.",
-    )(command)
+    from tooltip_cli.sources.base import Source
 
 
 @click.group()
@@ -75,11 +39,18 @@ def record() -> None:
       tooltip record bag drive.bag pliers.mcap --image /head/image_raw --rig rig.yaml
       tooltip record lerobot datasets/g1 can.mcap --episode 1
       tooltip record video pliers.mp4 pliers.mcap --joints joints.csv --rig rig.yaml
+      tooltip record camera pliers.mcap --camera 0 --joints udp://:9870 --rig rig.yaml
+      tooltip record ros2 pliers.mcap --duration 15 --rig rig.yaml
     """
 
 
+record.add_command(camera)
+record.add_command(ros2)
+record.add_command(list_)
+
+
 @record.command("sim", short_help="Simulate a robot that sweeps a tool.")
-@_out_argument
+@out_argument
 @click.option(
     "--tool",
     default="pliers",
@@ -119,7 +90,7 @@ def record() -> None:
     help="motorcycle, astronaut, coffee, chelsea, clutter, or auto: the seed chooses.",
 )
 @jobs_option
-@_result_options
+@result_options
 def sim(
     out: Path,
     tool: str,
@@ -174,17 +145,17 @@ def sim(
             stop=stop,
             on_image=advance,
         )
-    document = _tell(out, done.report)
+    document = tell(out, done.report)
     say(f"{done.labels}: simulated labels of the test frames")
-    _finish({**document, "labels": str(done.labels)}, as_json)
+    finish({**document, "labels": str(done.labels)}, as_json)
 
 
 @record.command("bag", short_help="Import ROS 1 and ROS 2 bags and other MCAP files.")
 @click.argument("bag", type=PATH, metavar="IN")
-@_out_argument
+@out_argument
 @topic_options
-@_rig_options
-@_result_options
+@rig_options
+@result_options
 def bag_(
     bag: Path,
     out: Path,
@@ -213,13 +184,13 @@ def bag_(
     from tooltip_cli.sources.bag import BagSource
 
     topics = Topics(image=image, joints=joints, info=info, pose=pose)
-    source = BagSource(bag, topics, _load_rig(rig), _load_urdf(robot))
-    _finish(_record(source, out, force, min_free), as_json)
+    source = BagSource(bag, topics, load_rig_file(rig), load_urdf(robot))
+    finish(_record(source, out, force, min_free), as_json)
 
 
 @record.command("lerobot", short_help="Import one episode of a LeRobot data set.")
 @click.argument("dataset", type=PATH, metavar="DATASET")
-@_out_argument
+@out_argument
 @click.option("--episode", type=int, required=True, metavar="N", help="Index of the episode.")
 @click.option("--camera", metavar="KEY", help="Image feature, where there are several.")
 @click.option(
@@ -229,8 +200,8 @@ def bag_(
     show_default=True,
     help="Feature that holds the joint positions, in rad or m.",
 )
-@_rig_options
-@_result_options
+@rig_options
+@result_options
 def lerobot(
     dataset: Path,
     out: Path,
@@ -255,13 +226,13 @@ def lerobot(
     """
     from tooltip_cli.sources.lerobot import LeRobotSource
 
-    source = LeRobotSource(dataset, episode, camera, state, _load_rig(rig), _load_urdf(robot))
-    _finish(_record(source, out, force, min_free), as_json)
+    source = LeRobotSource(dataset, episode, camera, state, load_rig_file(rig), load_urdf(robot))
+    finish(_record(source, out, force, min_free), as_json)
 
 
 @record.command("video", short_help="Import a video or a folder of images.")
 @click.argument("video", type=PATH, metavar="VIDEO_OR_FOLDER")
-@_out_argument
+@out_argument
 @click.option("--joints", type=PATH, metavar="CSV", help="Columns: stamp_ns, then one a joint.")
 @click.option("--poses", type=PATH, metavar="CSV", help="Columns: stamp_ns,x,y,z,qx,qy,qz,qw.")
 @click.option(
@@ -279,8 +250,8 @@ def lerobot(
     metavar="STAMP",
     help="Stamp of the first image: whole nanoseconds, or seconds with a point or 's'.",
 )
-@_rig_options
-@_result_options
+@rig_options
+@result_options
 def video_(
     video: Path,
     out: Path,
@@ -319,22 +290,10 @@ def video_(
         fps=fps,
         start_ns=parse_start(start) if start is not None else None,
         pose_frame=pose_frame,
-        rig=_load_rig(rig),
-        urdf=_load_urdf(robot),
+        rig=load_rig_file(rig),
+        urdf=load_urdf(robot),
     )
-    _finish(_record(source, out, force, min_free), as_json)
-
-
-def _load_rig(path: Path | None) -> Rig | None:
-    from tooltip_cli.rig.rigfile import load_rig
-
-    return load_rig(path) if path is not None else None
-
-
-def _load_urdf(path: Path | None) -> str | None:
-    from tooltip_cli.sources.streams import read_urdf
-
-    return read_urdf(path) if path is not None else None
+    finish(_record(source, out, force, min_free), as_json)
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -353,31 +312,8 @@ def _record(source: Source, out: Path, force: bool, min_free: int) -> dict[str, 
         report = write(
             source, out, overwrite=force, min_free_bytes=min_free, stop=stop, on_image=advance
         ).report
-    document = _tell(out, report)
+    document = tell(out, report)
     described = any(topic.endswith("robot_description") for topic in report.read)
     if source.rig is not None and source.rig.pose_topic is None and not described:
         say(f"{out}: holds no robot description; give --robot, or name it in the rig file")
     return document
-
-
-def _tell(out: Path, report: SourceReport) -> dict[str, Any]:
-    """Say what was read and left out, and return the result."""
-    read = ", ".join(f"{count} {topic}" for topic, count in sorted(report.read.items()))
-    say(f"{out}: {read}")
-    for reason, count in sorted(report.dropped.items()):
-        say(f"{out}: left out {count} {reason}")
-    for note in report.notes:
-        say(f"{out}: {note}")
-    return {
-        "recording": str(out),
-        "read": report.read,
-        "dropped": report.dropped,
-        "notes": report.notes,
-    }
-
-
-def _finish(document: dict[str, Any], as_json: bool) -> None:
-    if as_json:
-        print_json(document)
-    else:
-        click.echo(document["recording"])

@@ -67,7 +67,7 @@ def record(
         try:
             # first, so that they are in whatever part of the file survives
             if rig is not None:
-                _attach(writer, {name: text.encode() for name, text in rig_files(rig).items()})
+                attach_rig(writer, rig)
             for message in _messages(source, writer):
                 writer.write(message)
                 if message.topic == source.image_topic:
@@ -86,6 +86,11 @@ def record(
                 writer.discard()
             raise
     return Recorded(out, source.report)
+
+
+def attach_rig(writer: CrashSafeWriter, rig: Rig) -> None:
+    """Store a rig as files beside the messages."""
+    _attach(writer, {name: text.encode() for name, text in rig_files(rig).items()})
 
 
 def _messages(source: Source, writer: CrashSafeWriter) -> Iterator[Message]:

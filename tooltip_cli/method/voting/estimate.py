@@ -23,7 +23,7 @@ def check_motion(
 ) -> Reason | None:
     """Return why the hand's motion cannot show the tip, or None where it can."""
     trust, count = settings.trust, len(pairing.frames)
-    spread = _view_spread_deg(camera_from_hand[pairing.frames])
+    spread = view_spread_deg(camera_from_hand[pairing.frames])
     if count >= _FRAMES_FOR_SPREAD and spread < trust.min_view_angle_deg:
         return Reason(
             "depth_unobservable",
@@ -46,7 +46,7 @@ def check_motion(
     )
 
 
-def _view_spread_deg(camera_from_hand: Array) -> float:
+def view_spread_deg(camera_from_hand: Array) -> float:
     """Return the largest angle between the camera's directions seen from the hand, degrees."""
     seen_from = np.linalg.inv(camera_from_hand)[:, :3, 3]
     lengths = np.linalg.norm(seen_from, axis=1, keepdims=True)
