@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-import logging
 import mmap
-import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -18,20 +15,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tooltip_cli.method import _jit, blocks
-from tooltip_cli.method.blocks import BlockMatches, match_blocks, matchable
+from tooltip_cli.method import blocks
+from tooltip_cli.method.blocks import (
+    BlockMatches,
+    Form,
+    match_blocks,
+    matchable,
+    window_margin,
+)
 
 Image = npt.NDArray[np.uint8]
 Pixels = npt.NDArray[np.int32]
 
 try:
-    from tooltip_cli.method import _blocks_numba
-
-    NATIVE = _blocks_numba.mpsadbw_lanes()
+    BEST: int = blocks.best_form()
 except ImportError:
-    NATIVE = -1
+    BEST = -1
 
-needs_numba = pytest.mark.skipif(NATIVE < 0, reason="numba is not installed")
+needs_numba = pytest.mark.skipif(BEST < 0, reason="numba is not installed")
 
 KINDS = ["texture", "noise", "flat", "steps", "jpeg", "contrast"]
 
@@ -118,7 +119,7 @@ def assert_same(found: BlockMatches, expected: BlockMatches) -> None:
     assert found.covariances.dtype == np.float64
 
 
-def check_against_longhand(block: int, search: int, seed: int, mpsadbw: int | None) -> None:
+def check_against_longhand(block: int, search: int, seed: int, form: Form | None) -> None:
     """Compare one compiled form with the longhand one on every kind of image."""
     rng = np.random.default_rng(seed)
     margin = block // 2 + search // 2
@@ -142,7 +143,7 @@ def check_against_longhand(block: int, search: int, seed: int, mpsadbw: int | No
             int(np.ceil(tau)) - 1,
             alpha,
             offsets,
-            mpsadbw,
+            form,
         )
         assert_same(found, expected)
 
@@ -156,11 +157,11 @@ def test_compiled_form_equals_longhand(block: int, search: int) -> None:
 
 @needs_numba
 @pytest.mark.parametrize(("block", "search"), [(3, 3), (3, 21), (5, 11), (7, 9), (9, 17), (15, 13)])
-@pytest.mark.parametrize("mpsadbw", [0, 8, 16])
-def test_every_instruction_set_equals_longhand(block: int, search: int, mpsadbw: int) -> None:
-    if mpsadbw > NATIVE:
-        pytest.skip(f"this processor has no mpsadbw with {mpsadbw} results")
-    check_against_longhand(block, search, 7 * block + search, mpsadbw)
+@pytest.mark.parametrize("form", Form)
+def test_every_instruction_set_equals_longhand(block: int, search: int, form: Form) -> None:
+    if form > BEST:
+        pytest.skip(f"this processor is not one for {form.name}")
+    check_against_longhand(block, search, 7 * block + search, form)
 
 
 @settings(deadline=None, max_examples=60)
@@ -184,7 +185,7 @@ def test_both_forms_equal_longhand(data: st.DataObject) -> None:
     tau = data.draw(st.one_of(st.floats(1e-9, 1e4), st.integers(1, 500), st.just(float("inf"))))
     alpha = data.draw(st.floats(0, 10))
     expected = longhand(first, second, edges, block, search, tau, alpha, offsets)
-    for use_numba in (False, True) if NATIVE >= 0 else (False,):
+    for use_numba in (False, True) if BEST >= 0 else (False,):
         found = match_blocks(
             first,
             second,
@@ -286,7 +287,7 @@ def test_exactly_the_matchable_edges_are_matched(data: st.DataObject) -> None:
         window = {cv - 5, cv + 5} <= set(rows) and {cu - 5, cu + 5} <= set(columns)
         assert answer == (block and window)
     image = np.zeros(shape, np.uint8)
-    for use_numba in (False, True) if NATIVE >= 0 else (False,):
+    for use_numba in (False, True) if BEST >= 0 else (False,):
         for index, answer in enumerate(inside):
             one = slice(index, index + 1)
             options: dict[str, Any] = {
@@ -368,85 +369,31 @@ def before_a_wall(image: Image) -> Image:
 
 @needs_numba
 @pytest.mark.skipif(sys.platform != "linux", reason="needs mprotect")
-@pytest.mark.parametrize("mpsadbw", [0, 8, 16])
+@pytest.mark.parametrize("form", Form)
 @pytest.mark.parametrize(("block", "search"), [(5, 11), (7, 9), (9, 17)])
-def test_vectors_do_not_read_beyond_the_images(block: int, search: int, mpsadbw: int) -> None:
+def test_vectors_do_not_read_beyond_the_images(block: int, search: int, form: Form) -> None:
     """Reading one byte more would end this process."""
-    if mpsadbw > NATIVE:
-        pytest.skip(f"this processor has no mpsadbw with {mpsadbw} results")
+    if form > BEST:
+        pytest.skip(f"this processor is not one for {form.name}")
     margin = block // 2 + search // 2
     for width in (2 * margin + 1, 2 * margin + 2, 2 * margin + 30):
         shape = (2 * margin + 3, width)
         first, second = (before_a_wall(image) for image in image_pair("texture", width, shape))
         u, v = np.meshgrid(np.arange(margin, shape[1] - margin), np.arange(margin, margin + 3))
         edges = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.int32)
-        found = blocks._match_compiled(
-            first, second, edges, block, search, 199, 0.25, None, mpsadbw
-        )
+        found = blocks._match_compiled(first, second, edges, block, search, 199, 0.25, None, form)
         options: dict[str, Any] = {"block": block, "search": search, "use_numba": False}
         assert_same(found, match_blocks(first, second, edges, **options))
 
 
-@needs_numba
-def test_compiled_code_is_kept_on_disk(tmp_path: Path) -> None:
-    """A second process must not compile: the command line answers in time only from the cache."""
-    program = (
-        "from tooltip_cli.method import _blocks_numba as kernels\n"
-        "stats = kernels.matcher(5, 11, kernels.mpsadbw_lanes()).stats\n"
-        "print(sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))"
-    )
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    runs = [
-        subprocess.run(
-            [sys.executable, "-c", program],
-            env=environment,
-            cwd=Path(__file__).parents[1],
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.split()
-        for _ in range(2)
-    ]
-    assert runs == [["0", "1"], ["1", "0"]]
-
-
-@needs_numba
-def test_kernels_compile_without_a_cache_folder() -> None:
-    """Functions without a source file stand for an installation where nothing can be written."""
-    from numba import types
-
-    names: dict[str, Any] = {}
-    exec("def double(x):\n    return 2 * x", names)  # noqa: S102  (needs a fileless function)
-    assert _jit.compiled(names["double"], types.int64(types.int64))(21) == 42
-
-
-@pytest.mark.parametrize(
-    ("without", "said"),
-    [
-        pytest.param("import", "numba cannot be imported", id="absent"),
-        pytest.param("compiler", "NUMBA_DISABLE_JIT", id="off", marks=needs_numba),
-    ],
-)
-def test_slow_numpy_is_announced_once(
-    without: str, said: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    if without == "import":
-        monkeypatch.setitem(sys.modules, "numba", None)
-    else:
-        monkeypatch.setattr("numba.config.DISABLE_JIT", 1)
-    _jit.numba_available.cache_clear()
-    try:
-        first, second = image_pair("texture", 1, (40, 40))
-        edges = some_edges(np.random.default_rng(0), (40, 40), 7, 5)
-        with caplog.at_level(logging.WARNING):
-            for _ in range(2):
-                found = match_blocks(first, second, edges)
-        assert_same(found, longhand(first, second, edges))
-    finally:
-        _jit.numba_available.cache_clear()
-    warnings = [record for record in caplog.records if record.name == _jit.__name__]
-    assert len(warnings) == 1
-    assert said in warnings[0].getMessage()
+def test_the_margin_is_that_of_the_matchable_edges() -> None:
+    u, v = np.meshgrid(np.arange(40), np.arange(30))
+    edges = np.stack([u.ravel(), v.ravel()], axis=1)
+    for block, search in ((5, 11), (3, 7), (9, 3)):
+        margin = window_margin(block, search)
+        inside = edges[matchable(edges, (30, 40), block, search)]
+        assert inside.min(axis=0).tolist() == [margin, margin]
+        assert inside.max(axis=0).tolist() == [39 - margin, 29 - margin]
 
 
 @needs_numba

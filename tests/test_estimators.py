@@ -262,3 +262,22 @@ def test_map_beats_kmeans_on_what_it_models() -> None:
         for method in errors:
             errors[method] += error_mm(estimate(data, method))
     assert errors["map"] < errors["kmeans"]
+
+
+@both
+@pytest.mark.parametrize("seed", range(3))
+def test_of_very_many_views_a_sample_gives_the_same_within_its_uncertainty(
+    method: str, seed: int
+) -> None:
+    data = input_of(observe(500, noise_px=3.0, outliers=0.3, seed=9))
+    whole = estimate(data, method)
+    part = estimate(data, method, seed=seed, max_pairs=20_000, max_points=8_000, max_views=150)
+    assert whole.position is not None
+    assert part.position is not None
+    assert part.covariance is not None
+    apart = part.position - whole.position
+    assert apart @ np.linalg.solve(part.covariance, apart) < 9.0
+    if method == "kmeans":
+        assert part.position.tobytes() != whole.position.tobytes()
+    else:  # all views decide in the end
+        assert np.linalg.norm(apart) < 1e-6

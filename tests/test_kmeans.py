@@ -137,3 +137,15 @@ def test_the_nearest_of_equals_is_the_first(monkeypatch: pytest.MonkeyPatch) -> 
     assert whole.tolist() == [1] * 5 + [0] * 6
     monkeypatch.setattr("tooltip_cli.method.kmeans._BLOCK", 3)
     assert np.array_equal(nearest(points, means), whole)
+
+
+@pytest.mark.parametrize("dimensions", [1, 3])
+@pytest.mark.parametrize("count", [1, 7, 512, 1300])
+def test_both_forms_are_the_same_to_the_bit(count: int, dimensions: int) -> None:
+    pytest.importorskip("numba")
+    rng = np.random.default_rng(count)
+    points = np.round(rng.normal(size=(count, dimensions)), 1)  # with ties
+    means = np.concatenate([points[rng.integers(count, size=5)], np.full((1, dimensions), 99.0)])
+    plain, compiled = (lloyd(points, means, use_numba=use_numba) for use_numba in (False, True))
+    assert plain[0].tobytes() == compiled[0].tobytes()
+    np.testing.assert_array_equal(plain[1], compiled[1])

@@ -17,7 +17,7 @@ import tooltip_cli
 PACKAGE = Path(tooltip_cli.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
-# Each layer and the layers below it that it may import; errors and resources are for everybody.
+# Each layer and the layers below it that it may import; the last three are for everybody.
 LAYERS = {
     "cli": {"stages", "report", "sources", "labels", "log", "rig", "method"},
     "stages": {"report", "sources", "labels", "log", "rig", "method"},
@@ -29,8 +29,9 @@ LAYERS = {
     "method": set(),
     "errors": set(),
     "resources": set(),
+    "machine_code": set(),
 }
-FREE = {"errors", "resources", ""}
+FREE = {"errors", "resources", "machine_code", ""}
 HEAVY = (
     "av",
     "cv2",

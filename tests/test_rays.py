@@ -48,7 +48,7 @@ def test_closest_points_equal_a_least_squares_solution(
     assert np.allclose([a1, a2], found, atol=1e-8)
 
 
-@settings(max_examples=200)
+@settings(max_examples=200, deadline=None)
 @given(o1=points, d1=units, o2=points, d2=units)
 def test_the_midpoint_is_nearest_to_both_rays(o1: Array, d1: Array, o2: Array, d2: Array) -> None:
     """The point with the least sum of squared distances to two lines, by its normal equations."""
@@ -140,9 +140,9 @@ def test_all_pairs_of_rays_through_a_point_meet_there() -> None:
 
 def test_blocks_of_pairs_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     rays = towards(np.zeros(3), 30, noise=0.02)
-    whole = intersections(rays, max_distance=0.0254)
+    whole = intersections(rays, max_distance=0.0254, use_numba=False)
     monkeypatch.setattr("tooltip_cli.method.rays._ROWS_AT_A_TIME", 7)
-    parts = intersections(rays, max_distance=0.0254)
+    parts = intersections(rays, max_distance=0.0254, use_numba=False)
     assert np.array_equal(whole[0], parts[0])
     assert np.array_equal(whole[1], parts[1])
 
@@ -153,7 +153,7 @@ def test_the_order_of_rays_changes_nothing_not_even_a_bit(order: list[int]) -> N
     rays = towards(np.zeros(3), 20, noise=0.02, seed=3)
     shuffled = rays.select(np.array(order))
 
-    def rows(found: Array, pairs: npt.NDArray[np.intp], names: npt.NDArray[np.intp]) -> set[bytes]:
+    def rows(found: Array, pairs: npt.NDArray[np.int32], names: npt.NDArray[np.intp]) -> set[bytes]:
         keys = np.sort(names[pairs], axis=1)
         return {key.tobytes() + point.tobytes() for key, point in zip(keys, found, strict=True)}
 
@@ -200,7 +200,46 @@ def test_the_spread_is_the_largest_angle(angle: float, count: int) -> None:
     assert angular_spread(directions[:0]) == 0.0
 
 
-def test_the_spread_of_many_directions_is_found_across_blocks() -> None:
+def test_one_outlier_among_many_directions_spreads_them() -> None:
     directions = np.tile([0.0, 0.0, 1.0], (3000, 1))
     directions[2900] = [1.0, 0.0, 0.0]
     assert abs(angular_spread(directions) - np.pi / 2) < 1e-7
+
+
+@pytest.mark.parametrize("width", [0.02, 0.5, 3.0])
+def test_the_spread_of_very_many_directions_is_told_to_a_hundredth(width: float) -> None:
+    rng = np.random.default_rng(0)
+    directions = np.array([0.1, -0.2, 1.0]) + width * rng.uniform(-1, 1, (6000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    exact = float(np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0)))
+    assert 0.99 * exact <= angular_spread(directions) <= exact + 1e-7
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 150])
+def test_both_forms_of_the_intersections_are_the_same(count: int) -> None:
+    pytest.importorskip("numba")
+    rays = towards(np.array([0.1, 0.0, 0.2]), count, noise=0.02)
+    forms = [
+        intersections(rays, max_distance=0.0254, z_start=0.05, use_numba=use_numba)
+        for use_numba in (False, True)
+    ]
+    assert count < 150 or len(forms[0][0]) > 1000
+    for plain, compiled in zip(*forms, strict=True):
+        np.testing.assert_array_equal(compiled, plain)
+
+
+def test_of_too_many_pairs_a_seeded_sample_is_looked_at() -> None:
+    rays = towards(np.zeros(3), 60)
+    whole, pairs = intersections(rays, max_distance=1.0)
+    known = {tuple(pair): point for pair, point in zip(pairs.tolist(), whole, strict=True)}
+    found, some = intersections(rays, max_distance=1.0, max_pairs=500, seed=3)
+    assert 450 < len(found) <= 500
+    for pair, point in zip(some.tolist(), found, strict=True):
+        np.testing.assert_array_equal(point, known[tuple(pair)])
+    assert set(some.ravel().tolist()) == set(range(60))
+    again, _ = intersections(rays, max_distance=1.0, max_pairs=500, seed=3)
+    other, _ = intersections(rays, max_distance=1.0, max_pairs=500, seed=4)
+    np.testing.assert_array_equal(again, found)
+    assert not np.array_equal(other, found)
+    exactly_all, _ = intersections(rays, max_distance=1.0, max_pairs=60 * 59 // 2)
+    np.testing.assert_array_equal(exactly_all, whole)

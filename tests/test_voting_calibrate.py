@@ -59,7 +59,7 @@ def test_a_clock_offset_is_found(offset: float) -> None:
     assert found is not None
     assert found.correction.time_offset == pytest.approx(offset, abs=0.0015)
     assert found.correction.rotation is None
-    assert found.applied == (offset != 0.0)
+    assert found.applied is (offset != 0.0)  # a plain bool: it goes into JSON
     assert 0 < found.deviations[0] < 0.002
 
 

@@ -15,15 +15,17 @@ from tooltip_cli.cli.options import (
     json_option,
     out_option,
     print_json,
+    profile_option,
     progress,
     recordings_argument,
     rig_option,
     say,
+    say_profile,
     topic_options,
 )
 
 if TYPE_CHECKING:
-    from tooltip_cli.log.recording import Recording
+    from tooltip_cli.log.recording import Recording, Topics
 
 
 @click.command()
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
     "frames paired by the hand's motion, which needs the rig.",
 )
 @jobs_option
+@profile_option
 @out_option
 @topic_options
 @force_option
@@ -47,6 +50,7 @@ def detect(
     rig: Path | None,
     preset: str,
     jobs: int,
+    profile: bool,
     out: Path | None,
     image: str | None,
     joints: str | None,
@@ -69,44 +73,64 @@ def detect(
       tooltip detect *.mcap --jobs 2 --out results
       tooltip detect pliers.mcap --preset paper
     """
-    from tooltip_cli.log.recording import Topics, read_recording
-    from tooltip_cli.stages.detect import detect_in
+    from tooltip_cli.log.recording import Topics
+    from tooltip_cli.stages.clock import measuring
 
     results: list[dict[str, Any]] = []
     topics = Topics(image=image, joints=joints, info=info, pose=pose)
     check_names(recordings, out)
     for path in recordings:
-        recording = read_recording(path, topics)
-        with progress(len(recording.image_stamps_ns) - 1, f"detect {path.name}") as advance:
-            found = detect_in(recording, out=out, force=force, jobs=jobs, on_pair=advance)
-        for note in recording.notes:
-            say(f"{path}: {note}")
-        detections = found.detections
-        valid = int(detections.valid.sum())
-        flags = Counter(flag for row in detections.flags for flag in row)
-        how = "reused" if found.reused else "computed"
-        detail = "".join(f", {count} {flag}" for flag, count in sorted(flags.items()))
-        say(f"{path}: {how} {len(detections.frames)} pairs, {valid} detections{detail}")
-        results.append(
-            {
-                "recording": str(path),
-                "detections_file": str(found.path),
-                "reused": found.reused,
-                "pairs": len(detections.frames),
-                "detections": valid,
-                "flags": flags,
-            }
-        )
-        if preset == "voting":
-            if rig is None and "rig.yaml" not in recording.attachments:
-                say(f"{path}: no rig is stored or given, so only consecutive images are compared")
-            else:
-                results[-1]["edges_file"] = _detect_edges(recording, rig, out, force, jobs)
+        with measuring(profile) as stopwatch:
+            results.append(_detect_one(path, topics, rig, preset, out, force, jobs))
+        say_profile(str(path), stopwatch)
     if as_json:
         print_json(results)
     else:
         for result in results:
             click.echo(result["detections_file"])
+
+
+def _detect_one(
+    path: Path,
+    topics: Topics,
+    rig: Path | None,
+    preset: str,
+    out: Path | None,
+    force: bool,
+    jobs: int,
+) -> dict[str, Any]:
+    """Detect in one recording; returns what is said of it as JSON."""
+    from tooltip_cli.log.recording import read_recording
+    from tooltip_cli.stages.clock import laps
+    from tooltip_cli.stages.detect import detect_in
+
+    lap = laps()
+    recording = read_recording(path, topics)
+    lap("read")
+    with progress(len(recording.image_stamps_ns) - 1, f"detect {path.name}") as advance:
+        found = detect_in(recording, out=out, force=force, jobs=jobs, on_pair=advance)
+    for note in recording.notes:
+        say(f"{path}: {note}")
+    detections = found.detections
+    valid = int(detections.valid.sum())
+    flags = Counter(flag for row in detections.flags for flag in row)
+    how = "reused" if found.reused else "computed"
+    detail = "".join(f", {count} {flag}" for flag, count in sorted(flags.items()))
+    say(f"{path}: {how} {len(detections.frames)} pairs, {valid} detections{detail}")
+    result: dict[str, Any] = {
+        "recording": str(path),
+        "detections_file": str(found.path),
+        "reused": found.reused,
+        "pairs": len(detections.frames),
+        "detections": valid,
+        "flags": flags,
+    }
+    if preset == "voting":
+        if rig is None and "rig.yaml" not in recording.attachments:
+            say(f"{path}: no rig is stored or given, so only consecutive images are compared")
+        else:
+            result["edges_file"] = _detect_edges(recording, rig, out, force, jobs)
+    return result
 
 
 def _detect_edges(

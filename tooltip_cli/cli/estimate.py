@@ -17,11 +17,13 @@ from tooltip_cli.cli.options import (
     out_option,
     prefer_option,
     print_json,
+    profile_option,
     progress,
     recordings_argument,
     refinement_sentence,
     rig_option,
     say,
+    say_profile,
     topic_options,
 )
 
@@ -51,6 +53,7 @@ from tooltip_cli.cli.options import (
 )
 @prefer_option
 @jobs_option
+@profile_option
 @out_option
 @topic_options
 @force_option
@@ -65,6 +68,7 @@ def estimate(
     from_labels: Path | None,
     refine: str | None,
     jobs: int,
+    profile: bool,
     out: Path | None,
     image: str | None,
     joints: str | None,
@@ -88,6 +92,7 @@ def estimate(
     from tooltip_cli.log.recording import Topics
     from tooltip_cli.method.estimators import EstimatorParams
     from tooltip_cli.method.voting.params import VotingSettings
+    from tooltip_cli.stages.clock import measuring
     from tooltip_cli.stages.estimate import estimate as run
 
     if refine is not None and (method != "voting" or from_labels is not None):
@@ -96,7 +101,10 @@ def estimate(
     refusals = 0
     check_names(recordings, out)
     for path in recordings:
-        with progress(None, f"detect {path.name}, pairs") as advance:
+        with (
+            measuring(profile) as stopwatch,
+            progress(None, f"detect {path.name}, pairs") as advance,
+        ):
             found = run(
                 path,
                 rig=rig,
@@ -109,6 +117,7 @@ def estimate(
                 jobs=jobs,
                 on_pair=advance,
             )
+        say_profile(str(path), stopwatch)
         for note in found.notes:
             say(f"{path}: {note}")
         if found.detected is not None:

@@ -11,11 +11,14 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from tooltip_cli.errors import TooltipError
+
+if TYPE_CHECKING:
+    from tooltip_cli.stages.clock import Stopwatch
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -100,6 +103,24 @@ def json_option(command: _Command) -> _Command:
     return click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")(
         command
     )
+
+
+def profile_option(command: _Command) -> _Command:
+    """Add ``--profile``."""
+    return click.option(
+        "--profile", is_flag=True, help="Say where the processor time went, on stderr."
+    )(command)
+
+
+def say_profile(name: str, stopwatch: Stopwatch | None) -> None:
+    """Write where a stopwatch's time went; nothing where there is none."""
+    if stopwatch is None:
+        return
+    total = max(stopwatch.total(), 1e-9)
+    rest = total - sum(stopwatch.seconds.values())
+    say(f"{name}: {total:.2f} s of processor time")
+    for step, seconds in [*stopwatch.seconds.items(), ("rest", rest)]:
+        say(f"  {step:13s}{seconds:8.2f} s {seconds / total:5.0%}")
 
 
 def jobs_option(command: _Command) -> _Command:

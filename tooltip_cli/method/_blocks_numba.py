@@ -2,35 +2,33 @@
 
 The sums of absolute differences (SADs) of sixteen neighbouring displacements are formed side by
 side in the 16-bit lanes of a vector. Numba's loops are not turned into such code by LLVM, so the
-part that matters is handed to LLVM as vector code (`match_edge`): portable vectors, which become
-whatever the processor has, and on x86 the instruction ``mpsadbw``, which forms the SADs of four
-pixels at eight (SSE4.1) or sixteen (AVX2) displacements at once.
+part that matters is handed to LLVM as vector code (`_EdgeCode`): portable vectors, which become
+whatever the processor has, and on x86 the instructions ``mpsadbw`` and ``vdbpsadbw``, which form
+the SADs of four pixels at eight (SSE4.1) or sixteen (AVX2, AVX-512) displacements at once.
 
-This module imports numba; import it only where `_jit.numba_available` has said yes. The kernel and
-the vector code stay in one file because numba's cache on disk notices changes in the kernel's own
-file only.
+This module imports numba; `machine_code` imports it where there is something to compile, and
+notices changes in this file only.
 """
 
 from __future__ import annotations
 
 import functools
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
-from tooltip_cli.method import _jit
+from tooltip_cli.method.blocks import Form
 
-_PORTABLE_LANES = 16
 _BLOCK_ROWS_AT_ONCE = 55  # rows of blocks, 11 displacements of 5, in code without a loop
+
+# For `vdbpsadbw`, which lays pixels 0-3, 4-7, 4-7 and 8-11 of each half out before it compares.
+_SLIDING = 0x94
 
 _Image = tuple[Any, Any]  # address of a pixel, bytes from one row to the next
 _Rows = Sequence[tuple[list[Any], list[Any]]]  # quads and spare columns of rows of pixels
@@ -38,40 +36,31 @@ _Rows = Sequence[tuple[list[Any], list[Any]]]  # quads and spare columns of rows
 _BYTE, _LANE, _WORD, _INDEX = (ir.IntType(bits) for bits in (8, 16, 32, 64))
 
 
-def mpsadbw_lanes() -> int:
-    """Return how many SADs one ``mpsadbw`` gives on the processor numba compiles for.
-
-    16 with AVX2, 8 with SSE4.1, 0 where there is no such instruction.
-    """
-    features = cpu_target.target_context.codegen().magic_tuple()[2].split(",")
-    if "+avx2" in features:
-        return 16
-    return 8 if "+sse4.1" in features else 0
-
-
 class _EdgeCode:
     """Writes the vector code that matches one edge.
 
-    Of the block's columns ``mpsadbw`` takes four at a time (a quad); the spare ones, which are all
-    of them in portable code, add |a - b| = 2 max(a, b) - a - b, one instruction fewer for every
-    pixel than a difference and its absolute value. Where the last quad lacks a column (blocks of
-    3, 7, 11, 15), zeros fill it, and what they add, the second image's pixels, is subtracted as -b
-    of a spare column.
+    Of the block's columns the instructions take four at a time (a quad). A single column that is
+    left (blocks of 5, 9, 13) adds |a - b|. Where the last quad lacks a column (blocks of 3, 7, 11,
+    15), zeros fill it, and what they add, the second image's pixels, is subtracted as -b of a spare
+    column. In portable code all columns are spare and add |a - b| = 2 max(a, b) - a - b: one
+    instruction fewer for every pixel than a difference and its magnitude.
 
     Attributes:
         lanes: displacements side by side in one vector, of type `vector`.
         pieces: vectors for one row of displacements.
         quads: first columns of the quads.
         spare: spare columns.
+        single: whether one column is left beside the quads.
     """
 
-    def __init__(self, builder: Any, block: int, search: int, mpsadbw: int) -> None:
-        self.builder, self.block, self.search = builder, block, search
-        self.lanes = mpsadbw or _PORTABLE_LANES
+    def __init__(self, builder: Any, block: int, search: int, form: Form) -> None:
+        self.builder, self.block, self.search, self.form = builder, block, search, form
+        self.lanes = form.lanes
         self.pieces = -(-search // self.lanes)
-        self.quads = range(0, block - 2, 4) if mpsadbw else range(0)
+        self.quads = range(0) if form is Form.PORTABLE else range(0, block - 2, 4)
         taken = 4 * len(self.quads)
         self.spare = range(min(block, taken), max(block, taken))
+        self.single = self.block == taken + 1
         self.vector = ir.VectorType(_LANE, self.lanes)
 
     def at(self, pointer: Any, offset: int) -> Any:
@@ -97,6 +86,9 @@ class _EdgeCode:
 
     def pick(self, extreme: str, left: Any, right: Any) -> Any:
         return self.call(f"llvm.{extreme}.v{self.lanes}i16", self.vector, left, right)
+
+    def magnitude(self, lanes: Any) -> Any:
+        return self.call(f"llvm.abs.v{self.lanes}i16", self.vector, lanes, ir.IntType(1)(0))
 
     def least_lane(self, lanes: Any) -> Any:
         return self.call(f"llvm.vector.reduce.umin.v{self.lanes}i16", _LANE, lanes)
@@ -143,20 +135,32 @@ class _EdgeCode:
         ]
         return quads, spare
 
+    def quad_sads(self, row: Any, quad: Any) -> Any:
+        """The SADs of a quad of the block at neighbouring displacements along a row of pixels."""
+        if self.form is Form.AVX512:
+            name = "llvm.x86.avx512.dbpsadbw.256"
+            return self.call(name, self.vector, quad, row, _WORD(_SLIDING))
+        name = "llvm.x86.avx2.mpsadbw" if self.form is Form.AVX2 else "llvm.x86.sse41.mpsadbw"
+        return self.call(name, self.vector, row, quad, _BYTE(0))
+
     def sad_rows(self, block_rows: _Rows, window_rows: _Rows) -> list[Any]:
         """The SADs of neighbouring rows of displacements, from all rows of pixels they need."""
         builder, zero = self.builder, self.vector([0] * self.lanes)
-        mpsadbw = "llvm.x86.avx2.mpsadbw" if self.lanes == 16 else "llvm.x86.sse41.mpsadbw"
         count = len(window_rows) - self.block + 1
         sums, maxima = [zero] * count, [zero] * count
         for y, (quads, spare) in enumerate(window_rows):
             for dv in range(max(0, y - self.block + 1), min(count, y + 1)):
                 block_quads, block_spare = block_rows[y - dv]
                 for theirs, ours in zip(quads, block_quads, strict=True):
-                    part = self.call(mpsadbw, self.vector, theirs, ours, _BYTE(0))
-                    sums[dv] = builder.add(sums[dv], part)
+                    sums[dv] = builder.add(sums[dv], self.quad_sads(theirs, ours))
+                if self.single:
+                    difference = builder.sub(spare[0], block_spare[0])
+                    sums[dv] = builder.add(sums[dv], self.magnitude(difference))
+                    continue
                 for theirs, ours in zip(spare, block_spare, strict=False):
                     maxima[dv] = builder.add(maxima[dv], self.pick("smax", theirs, ours))
+        if self.single:
+            return sums
         totals = [functools.reduce(builder.add, spare) for _, spare in window_rows]
         taken_off = itertools.chain(*(spare for _, spare in block_rows), totals[: self.block - 1])
         below = functools.reduce(builder.add, taken_off)
@@ -168,16 +172,14 @@ class _EdgeCode:
             below = builder.sub(below, totals[dv])
         return sads
 
-    def sad_map(self, block: _Image, window: _Image) -> Any:
-        """Write the SADs of all displacements into a new buffer and return its address.
+    def write_sads(self, block: _Image, window: _Image, sads: Any) -> None:
+        """Write the SADs of all displacements.
 
-        The buffer holds search rows of `pieces` vectors; lanes outside the window hold 0xFFFF.
+        They are search rows of `pieces` vectors; lanes outside the window hold 0xFFFF.
         """
         builder = self.builder
         rows = min(self.search, _BLOCK_ROWS_AT_ONCE // self.block)
         block_rows = [self.block_row(self.row(block, _INDEX(y))) for y in range(self.block)]
-        buffer = cgutils.alloca_once(builder, ir.ArrayType(self.vector, self.search * self.pieces))
-        sads = builder.bitcast(buffer, self.vector.as_pointer())
         with cgutils.for_range(builder, _INDEX(-(-self.search // rows))) as loop:
             # The last rows may overlap the ones before: the same numbers are written again.
             wanted, last = builder.mul(loop.index, _INDEX(rows)), _INDEX(self.search - rows)
@@ -191,8 +193,7 @@ class _EdgeCode:
                 for dv, sad in enumerate(self.sad_rows(block_rows, pixels)):
                     index = builder.mul(builder.add(top, _INDEX(dv)), _INDEX(self.pieces))
                     place = builder.gep(sads, [builder.add(index, _INDEX(piece))])
-                    builder.store(builder.or_(sad, outside), place)
-        return sads
+                    builder.store(builder.or_(sad, outside), place, align=2)
 
     def best(self, rows: list[list[Any]], ranks: Any) -> tuple[Any, Any]:
         """The lowest SAD and the lowest rank of the displacements that have it."""
@@ -216,10 +217,9 @@ class _EdgeCode:
         """
         builder, reach = self.builder, self.search // 2
         threshold = self.splat(highest, self.lanes)
-        wide = ir.VectorType(_WORD, self.lanes)
         x = range(-reach, reach + 1)
         ones, squares = [1] * self.search, [value * value for value in x]
-        sums: list[Any] = [_WORD(0)] * 6
+        parts: list[list[Any]] = [[] for _ in range(6)]
         for piece in range(self.pieces):
             count = once = twice = self.vector([0] * self.lanes)
             for row in rows:
@@ -228,17 +228,56 @@ class _EdgeCode:
                 once = builder.add(once, count)
                 twice = builder.add(twice, once)
             weighted = [(count, ones), (count, x), (count, squares), (once, ones), (once, x)]
-            for index, (lanes, values) in enumerate([*weighted, (twice, ones)]):
-                factors = builder.sext(self.constant(piece, values, 0), wide)
-                product = builder.mul(builder.zext(lanes, wide), factors)
-                total = self.call(f"llvm.vector.reduce.add.v{self.lanes}i32", _WORD, product)
-                sums[index] = builder.add(sums[index], total)
-        return sums
+            for part, (lanes, values) in zip(parts, [*weighted, (twice, ones)], strict=True):
+                part.append(self.weigh(lanes, self.constant(piece, values, 0)))
+        return self.totals([functools.reduce(builder.add, part) for part in parts])
 
-    def match(self, block: _Image, window: _Image, ranks: Any, excess: Any) -> list[Any]:
-        """The eight numbers that `match_edge` returns."""
+    @property
+    def signed(self) -> bool:
+        """Whether all running totals fit 15 bits, as x86's multiplication of lanes wants them."""
+        return self.form is not Form.PORTABLE and self.search <= 55
+
+    def weigh(self, lanes: Any, factors: Any) -> Any:
+        """Products of lanes and constants as 32-bit lanes, neighbours added up where that is one
+        instruction."""
+        if self.signed:
+            half = ir.VectorType(_WORD, self.lanes // 2)
+            name = "llvm.x86.avx2.pmadd.wd" if self.lanes == 16 else "llvm.x86.sse2.pmadd.wd"
+            return self.call(name, half, lanes, factors)
+        wide = ir.VectorType(_WORD, self.lanes)
+        return self.builder.mul(self.builder.zext(lanes, wide), self.builder.sext(factors, wide))
+
+    def totals(self, vectors: list[Any]) -> list[Any]:
+        """The sums over the lanes of six vectors of 32-bit lanes."""
         builder = self.builder
-        sads = self.sad_map(block, window)
+        if not self.signed:
+            name = f"llvm.vector.reduce.add.v{self.lanes}i32"
+            return [self.call(name, _WORD, vector) for vector in vectors]
+        quarter = ir.VectorType(_WORD, 4)
+        if self.lanes == 16:
+            lower, upper = quarter(list(range(4))), quarter(list(range(4, 8)))
+            vectors = [
+                builder.add(
+                    builder.shuffle_vector(vector, vector, lower),
+                    builder.shuffle_vector(vector, vector, upper),
+                )
+                for vector in vectors
+            ]
+
+        def neighbours(left: Any, right: Any) -> Any:
+            return self.call("llvm.x86.ssse3.phadd.d.128", quarter, left, right)
+
+        a, b, c, d, e, f = vectors
+        four, two = neighbours(neighbours(a, b), neighbours(c, d)), neighbours(e, f)
+        two = neighbours(two, two)
+        return [
+            *(builder.extract_element(four, _WORD(lane)) for lane in range(4)),
+            *(builder.extract_element(two, _WORD(lane)) for lane in range(2)),
+        ]
+
+    def summary(self, sads: Any, ranks: Any, excess: Any) -> list[Any]:
+        """The eight numbers that `summarize` returns."""
+        builder = self.builder
         rows = [
             [self.load(self.at(sads, y * self.pieces + p), self.vector) for p in range(self.pieces)]
             for y in range(self.search)
@@ -250,148 +289,179 @@ class _EdgeCode:
         sums = [builder.sext(total, _INDEX) for total in self.moments(rows, highest)]
         return [builder.zext(least, _INDEX), builder.zext(rank, _INDEX), *sums]
 
+    def slot(self, sads: Any, index: Any) -> Any:
+        """The address of one edge's SADs among those of several."""
+        rows = self.builder.bitcast(sads, self.vector.as_pointer())
+        offset = self.builder.mul(index, _INDEX(self.search * self.pieces))
+        return self.builder.gep(rows, [offset])
 
-def _match_edge(
+
+_PIXELS, _LANES = types.CPointer(types.uint8), types.CPointer(types.uint16)
+
+
+def _compare(
     _typing: Any,
     first: Any,
+    block_at: Any,
     first_stride: Any,
-    window: Any,
-    window_stride: Any,
+    second: Any,
+    window_at: Any,
+    second_stride: Any,
+    sads: Any,
+    slot: Any,
+    block: Any,
+    search: Any,
+    form: Any,
+) -> Any:
+    """Write the SADs of one edge at all displacements, in numba code.
+
+    Args:
+        first: the first image, by its address.
+        block_at: where in it the block's top left pixel is.
+        first_stride: bytes from one row of it to the next.
+        second: the second image, or the scratch copy of the window, likewise.
+        window_at: where in it the search window's top left pixel is.
+        second_stride: bytes from one row of it to the next.
+        sads: space for the SADs of several edges, by its address.
+        slot: which of them this edge is.
+        block, search, form: the constants of `matcher`.
+    """
+    sides = block.literal_value, search.literal_value
+    kind = Form(form.literal_value)
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        code = _EdgeCode(builder, *sides, kind)
+        block_image = (builder.gep(values[0], [values[1]]), values[2])
+        window_image = (builder.gep(values[3], [values[4]]), values[5])
+        code.write_sads(block_image, window_image, code.slot(values[6], values[7]))
+        return context.get_dummy_value()
+
+    image = [_PIXELS, types.int64, types.int64]
+    signature = types.void(*image, *image, _LANES, types.int64, block, search, form)
+    return signature, generate
+
+
+def _summarize(
+    _typing: Any,
+    sads: Any,
+    slot: Any,
     ranks: Any,
     excess: Any,
     block: Any,
     search: Any,
-    mpsadbw: Any,
+    form: Any,
 ) -> Any:
-    """Match one edge, in numba code.
+    """Find the best of the SADs that `compare` wrote, and who is similar, in numba code.
 
     Args:
-        first: address of the block's top left pixel in the first image.
-        first_stride: bytes from one row of it to the next.
-        window: address of the search window's top left pixel in the second image.
-        window_stride: bytes from one row of it to the next.
-        ranks: address of a `rank_table`.
+        sads: the SADs of several edges, by their address.
+        slot: which of them.
+        ranks: a `blocks.rank_table`, by its address.
         excess: how much a SAD may exceed the lowest one and still count as similar.
-        block, search, mpsadbw: the constants of `matcher`.
+        block, search, form: the constants of `matcher`.
 
     Returns:
         The lowest SAD, its rank, and the six sums of `_EdgeCode.moments`.
     """
-    constants = [constant.literal_value for constant in (block, search, mpsadbw)]
+    sides = block.literal_value, search.literal_value
+    kind = Form(form.literal_value)
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        block_at, window_at, ranks_at = (
-            builder.inttoptr(values[index], _BYTE.as_pointer()) for index in (0, 2, 4)
-        )
-        numbers = _EdgeCode(builder, *constants).match(
-            (block_at, values[1]), (window_at, values[3]), ranks_at, values[5]
-        )
+        code = _EdgeCode(builder, *sides, kind)
+        ranks_at = builder.bitcast(values[2], _BYTE.as_pointer())
+        numbers = code.summary(code.slot(values[0], values[1]), ranks_at, values[3])
         return context.make_tuple(builder, signature.return_type, numbers)
 
-    signature = types.UniTuple(types.int64, 8)(*[types.int64] * 6, block, search, mpsadbw)
+    signature = types.UniTuple(types.int64, 8)(
+        _LANES, types.int64, _LANES, types.int64, block, search, form
+    )
     return signature, generate
 
 
-match_edge = intrinsic(prefer_literal=True)(_match_edge)
+compare = intrinsic(prefer_literal=True)(_compare)
+summarize = intrinsic(prefer_literal=True)(_summarize)
 
 
-def rank_table(displacements: npt.NDArray[np.int32], mpsadbw: int) -> npt.NDArray[np.uint16]:
-    """Return the (search, lanes) ranks of the displacements, filled up to whole vectors."""
-    search = math.isqrt(len(displacements))
-    lanes = mpsadbw or _PORTABLE_LANES
-    table = np.full((search, -(-search // lanes) * lanes), 0xFFFF, np.uint16)
-    column, row = displacements.T + search // 2
-    table[row, column] = np.arange(len(displacements))
-    return table
+def matcher(block: int, search: int, form: int, slots: int) -> Callable[..., int]:
+    """Return the loop over the edges for one size of block and search window, to be compiled.
 
-
-def row_bytes(block: int, search: int) -> int:
-    """Return how many bytes `match_edge` may read from the start of each row of a window."""
-    return search + block + 32
-
-
-_IMAGE = types.Array(types.uint8, 2, "C", readonly=True)
-_PAIRS = types.Array(types.int32, 2, "C", readonly=True)
-_SIGNATURE = types.int64(
-    _IMAGE,
-    _IMAGE,
-    _PAIRS,
-    _PAIRS,
-    types.int64,
-    types.float64,
-    _PAIRS,
-    types.uint16[:, ::1],
-    types.uint8[:, ::1],
-    types.int32[:, ::1],
-    types.int32[::1],
-    types.float64[:, ::1],
-)
-
-
-@functools.cache
-def matcher(block: int, search: int, mpsadbw: int) -> Callable[..., int]:
-    """Return the compiled loop over the edges for one size of block and search window.
-
-    Its arguments are the two images, (N, 2) edges, (N, 2) or (0, 2) offsets, the excess of
-    `match_edge`, alpha, the (search^2, 2) displacements in the order in which ties are decided,
-    their `rank_table`, a scratch array of search + block - 1 rows of `row_bytes`, and the (N, 2),
-    (N,) and (N, 3) results to fill. It returns the index of the first edge whose block or window
+    Its arguments are what `blocks._match_compiled` gives: the two images and their size; N edges
+    and, unless ``moved`` is 0, as many offsets, all as u, v; how much a SAD may exceed the lowest
+    one and still count as similar; alpha; the displacements in the order in which ties are decided,
+    and their `blocks.rank_table`; how many bytes `compare` may read from the start of a window's
+    row, and scratch space for a window of such rows; space for the SADs of ``slots`` edges; and the
+    results to fill. It returns the index of the first edge whose block or window
     leaves the image, or -1.
+
+    Some edges are compared first and summarized afterwards: what depends on what within an edge
+    then waits less, because the processor works on several at a time.
 
     Args:
         block: side of the blocks, pixels; odd, 3 to 15.
         search: side of the search window, pixels; odd, 3 to 71.
-        mpsadbw: what `mpsadbw_lanes` says, or 0 for portable code.
+        form: the `blocks.Form` of the code.
+        slots: edges that are compared before they are summarized.
     """
     half, margin = block // 2, block // 2 + search // 2
-    side, reach = 2 * margin + 1, row_bytes(block, search)
+    side = 2 * margin + 1
 
     def match_all(
         first: Any,
         second: Any,
+        height: int,
+        width: int,
         edges: Any,
+        count: int,
         offsets: Any,
-        excess: Any,
-        alpha: Any,
+        moved: int,
+        excess: int,
+        alpha: float,
         displacements: Any,
         ranks: Any,
+        reach: int,
         scratch: Any,
+        sads: Any,
         translations: Any,
         sad: Any,
         covariances: Any,
     ) -> int:
-        height, width = second.shape
-        first_at, second_at = np.int64(first.ctypes.data), np.int64(second.ctypes.data)
-        scratch_at, ranks_at = np.int64(scratch.ctypes.data), np.int64(ranks.ctypes.data)
-        for i in range(edges.shape[0]):
-            u, v = np.int64(edges[i, 0]), np.int64(edges[i, 1])
-            if u < half or v < half or u >= width - half or v >= height - half:
-                return i
-            du, dv = np.int64(0), np.int64(0)
-            if offsets.shape[0] > 0:
-                du, dv = np.int64(offsets[i, 0]), np.int64(offsets[i, 1])
-            left, top = u + du - margin, v + dv - margin
-            if left < 0 or top < 0 or left + side > width or top + side > height:
-                return i
-            window, stride = second_at + top * width + left, width
-            if (top + side - 1) * width + left + reach > second.size:
-                # Vectors read beyond the window's last column; here that would leave the image.
-                for y in range(side):
-                    for x in range(side):
-                        scratch[y, x] = second[top + y, left + x]
-                window, stride = scratch_at, scratch.shape[1]
-            block_at = first_at + (v - half) * width + u - half
-            least, rank, n, x, xx, k, kx, kk = match_edge(
-                block_at, width, window, stride, ranks_at, excess, block, search, mpsadbw
-            )
-            bu, bv = np.int64(displacements[rank, 0]), np.int64(displacements[rank, 1])
-            translations[i, 0], translations[i, 1] = du + bu, dv + bv
-            sad[i] = least
-            # Scatter around the best match, in integers until the division; bk is its row's k.
-            bk = search - search // 2 - bv
-            covariances[i, 0] = alpha + (xx - 2 * bu * x + n * bu * bu) / n
-            covariances[i, 1] = (bk * x - kx + bu * k - n * bu * bk) / n
-            covariances[i, 2] = alpha + (2 * kk - k - 2 * bk * k + n * bk * bk) / n
+        for start in range(0, count, slots):
+            stop = min(start + slots, count)
+            for i in range(start, stop):
+                u, v = np.int64(edges[2 * i]), np.int64(edges[2 * i + 1])
+                if u < half or v < half or u >= width - half or v >= height - half:
+                    return i
+                left, top = u - margin, v - margin
+                if moved > 0:
+                    left, top = left + offsets[2 * i], top + offsets[2 * i + 1]
+                if left < 0 or top < 0 or left + side > width or top + side > height:
+                    return i
+                image, window, stride = second, top * width + left, width
+                if (top + side - 1) * width + left + reach > height * width:
+                    # Vectors read beyond the window's last column; here that leaves the image.
+                    for y in range(side):
+                        for x in range(side):
+                            scratch[y * reach + x] = second[(top + y) * width + left + x]
+                    image, window, stride = scratch, np.int64(0), reach
+                block_at, slot = (v - half) * width + u - half, i - start
+                compare(
+                    first, block_at, width, image, window, stride, sads, slot, block, search, form
+                )
+            for i in range(start, stop):
+                least, rank, n, x, xx, k, kx, kk = summarize(
+                    sads, i - start, ranks, excess, block, search, form
+                )
+                bu, bv = np.int64(displacements[2 * rank]), np.int64(displacements[2 * rank + 1])
+                translations[2 * i], translations[2 * i + 1] = bu, bv
+                if moved > 0:
+                    translations[2 * i] += offsets[2 * i]
+                    translations[2 * i + 1] += offsets[2 * i + 1]
+                sad[i] = least
+                # Scatter around the best match, in integers until the division; bk: its row's k.
+                bk = search - search // 2 - bv
+                covariances[3 * i] = alpha + (xx - 2 * bu * x + n * bu * bu) / n
+                covariances[3 * i + 1] = (bk * x - kx + bu * k - n * bu * bk) / n
+                covariances[3 * i + 2] = alpha + (2 * kk - k - 2 * bk * k + n * bk * bk) / n
         return -1
 
-    return _jit.compiled(match_all, _SIGNATURE)
+    return match_all

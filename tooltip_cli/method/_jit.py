@@ -1,12 +1,11 @@
-"""Compilation of kernels with numba, typed and cached, for the modules that also have a numpy form.
+"""Compilation of kernels with numba, typed and cached, for callers that hold numba's arrays.
 
-Kernels live in modules named ``_*_numba.py``, which import numba at the top; only code that has
-asked `numba_available` may import those.
+Such kernels live in modules named ``_*_numba.py``, which import numba at the top, and their callers
+import them where they run. `machine_code` does the same without numba in later processes.
 """
 
 from __future__ import annotations
 
-import functools
 import logging
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -14,28 +13,6 @@ from typing import Any, TypeVar
 _LOGGER = logging.getLogger(__name__)
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
-
-
-@functools.cache
-def numba_available() -> bool:
-    """Return whether numba can compile; says once, as a warning, that it cannot.
-
-    Importing numba takes about 0.2 s, which is why nothing imports it before it is needed.
-    """
-    try:
-        import numba
-    except ImportError as error:
-        obstacle = f"numba cannot be imported ({error})"
-    else:
-        if not numba.config.DISABLE_JIT:
-            return True
-        obstacle = "numba's compiler is switched off (NUMBA_DISABLE_JIT)"
-    _LOGGER.warning(
-        "%s: the detector falls back to plain numpy, which gives the same answers about a "
-        "hundred times slower",
-        obstacle,
-    )
-    return False
 
 
 def compiled(function: _Function, signature: Any) -> _Function:

@@ -8,13 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tooltip_cli.method import _jit
+from tooltip_cli import machine_code
 
 Floats = npt.NDArray[np.float64]
 Pairs = npt.NDArray[np.integer] | npt.NDArray[np.floating]
 
 # A parameter counts as undetermined when the others explain all but this part of its variance.
 _SINGULAR = 1e-12
+
+# Of `_affine_numba.background_fitter`; pixels are whole numbers or not.
+_ARGUMENTS = "{0}* {0}* f64* i64 f64* i64 i64 f64 f64 f64 f64* i32* i32* f64* f64* f64* f64* u8*"
 
 STILL: Floats = np.eye(2, 3)  # the model of a background that does not move
 STILL.flags.writeable = False
@@ -140,10 +143,12 @@ def fit_background(
         raise ValueError(f"start is {start}; expected a finite affine model of shape (2, 3)")
     if len(edges) < 3:
         return None
-    if use_numba is None:
-        use_numba = _jit.numba_available()
-    run = _fit_compiled if use_numba else _fit_numpy
-    return run(edges, translations, covariances, start, iterations, drop_fraction, keep_within**2)
+    schedule = (start, iterations, drop_fraction, keep_within**2)
+    return machine_code.fast_or_slow(
+        lambda: _fit_compiled(edges, translations, covariances, *schedule),
+        lambda: _fit_numpy(edges, translations, covariances, *schedule),
+        use_numba,
+    )
 
 
 def _fit_compiled(
@@ -155,24 +160,31 @@ def _fit_compiled(
     drop_fraction: float,
     keep_below: float,
 ) -> AffineFit | None:
-    from tooltip_cli.method import _affine_numba as kernels
-
-    count, integers = len(edges), edges.dtype == translations.dtype == np.int32
-    pairs = np.int32 if integers else np.float64
-    fit = AffineFit(np.empty((2, 3)), np.zeros(count), np.empty(count, np.bool_))
-    found = kernels.background_fitter(integers)(
-        np.ascontiguousarray(edges, pairs).reshape(-1),
-        np.ascontiguousarray(translations, pairs).reshape(-1),
-        np.ascontiguousarray(covariances, np.float64).reshape(-1),
-        np.empty(0) if start is None else np.ascontiguousarray(start, np.float64).reshape(-1),
+    count, whole = len(edges), edges.dtype == translations.dtype == np.int32
+    kind, pairs = ("i32", np.int32) if whole else ("f64", np.float64)
+    background = machine_code.kernel(
+        "tooltip_cli.method._affine_numba", "background_fitter", _ARGUMENTS.format(kind)
+    )
+    fit = AffineFit(np.empty((2, 3)), np.empty(count), np.empty(count, np.bool_))
+    found = background(
+        np.ascontiguousarray(edges, pairs),
+        np.ascontiguousarray(translations, pairs),
+        np.ascontiguousarray(covariances, np.float64),
+        count,
+        np.array(STILL if start is None else start, np.float64, order="C"),
+        start is not None,
         iterations,
         drop_fraction,
         keep_below,
         _SINGULAR,
         np.empty((7, count)),
-        fit.model.reshape(-1),
+        np.empty(count, np.int32),
+        np.empty((4, 1024), np.int32),
+        np.empty(24),
+        np.empty(42),
+        fit.model,
         fit.distances,
-        fit.inliers,
+        fit.inliers.view(np.uint8),
     )
     return fit if found else None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import functools
 import math
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tooltip_cli.method import _jit
+from tooltip_cli import machine_code
 
 Bytes = npt.NDArray[np.uint8]
 Pixels = npt.NDArray[np.int32]
@@ -19,7 +20,27 @@ Pixels = npt.NDArray[np.int32]
 MAX_BLOCK = 15
 MAX_SEARCH = 71
 
+_ARGUMENTS = (  # of `_blocks_numba.matcher`
+    "u8* u8* i64 i64 i32* i64 i32* i64 i64 f64 i32* u16* i64 u8* u16* i32* i32* f64*"
+)
+_NO_OFFSETS: Pixels = np.empty((0, 2), np.int32)
+_KERNELS = "tooltip_cli.method._blocks_numba"
+_SLOTS = 8  # edges that the compiled form compares before it looks at what came out
 _EDGES_AT_ONCE = 256  # bounds the temporaries of the numpy form to a few megabytes
+
+
+class Form(enum.IntEnum):
+    """What the compiled form is made of, by what a processor must have for it."""
+
+    PORTABLE = 0
+    SSE41 = 1
+    AVX2 = 2
+    AVX512 = 3  # AVX-512 BW and VL
+
+    @property
+    def lanes(self) -> int:
+        """Displacements that are looked at side by side."""
+        return 8 if self is Form.SSE41 else 16
 
 
 @dataclass(frozen=True)
@@ -61,6 +82,11 @@ def matchable(
         return _inside(edges, shape, half + search // 2)
     centres = np.add(edges, offsets, dtype=np.int64)
     return _inside(edges, shape, half) & _inside(centres, shape, half + search // 2)
+
+
+def window_margin(block: int, search: int) -> int:
+    """Return how far from the border an edge must be for its block and window to be in view."""
+    return block // 2 + search // 2
 
 
 def match_blocks(
@@ -106,10 +132,10 @@ def match_blocks(
     offsets = None if offsets is None else _pairs("offsets", offsets, len(edges))
     _check(block, search, tau, alpha)
     excess = math.ceil(min(tau, 1e6)) - 1  # SADs are integers: s_j - s_b < tau is at most this
-    if use_numba is None:
-        use_numba = _jit.numba_available()
-    run = _match_compiled if use_numba else _match_numpy
-    return run(first, second, edges, block, search, excess, alpha, offsets)
+    arguments = (first, second, edges, block, search, excess, alpha, offsets)
+    return machine_code.fast_or_slow(
+        lambda: _match_compiled(*arguments), lambda: _match_numpy(*arguments), use_numba
+    )
 
 
 def _match_compiled(
@@ -121,26 +147,33 @@ def _match_compiled(
     excess: int,
     alpha: float,
     offsets: Pixels | None,
-    mpsadbw: int | None = None,
+    form: Form | None = None,
 ) -> BlockMatches:
-    from tooltip_cli.method import _blocks_numba as kernels
-
-    lanes = kernels.mpsadbw_lanes() if mpsadbw is None else mpsadbw
+    form = best_form() if form is None else form
+    constants = (block, search, int(form), _SLOTS)
+    match = machine_code.kernel(_KERNELS, "matcher", _ARGUMENTS, *constants)
     matches = BlockMatches(
         translations=np.empty((len(edges), 2), np.int32),
         sad=np.empty(len(edges), np.int32),
         covariances=np.empty((len(edges), 3)),
     )
-    outside = kernels.matcher(block, search, lanes)(
+    ranks = rank_table(search, form)
+    reach = search + block + 32  # what the compiled form may read from the start of a window's row
+    outside = match(
         first,
         second,
+        *first.shape,
         edges,
-        np.empty((0, 2), np.int32) if offsets is None else offsets,
+        len(edges),
+        _NO_OFFSETS if offsets is None else offsets,
+        0 if offsets is None else len(offsets),
         excess,
         alpha,
         _displacements(search),
-        kernels.rank_table(_displacements(search), lanes),
-        np.zeros((search + block - 1, kernels.row_bytes(block, search)), np.uint8),
+        ranks,
+        reach,
+        np.zeros((search + block - 1, reach), np.uint8),
+        _at_cache_line(_SLOTS * ranks.size),
         matches.translations,
         matches.sad,
         matches.covariances,
@@ -228,6 +261,38 @@ def _displacements(search: int) -> Pixels:
     steps = np.stack([du, dv], axis=1)[order].astype(np.int32)
     steps.flags.writeable = False
     return steps
+
+
+@functools.cache
+def best_form() -> Form:
+    """Return the fastest form of the matcher that this processor can run.
+
+    Raises:
+        ImportError: llvmlite, which numba brings, cannot be imported.
+    """
+    features = machine_code.cpu_features()
+    if {"avx512bw", "avx512vl"} <= features:
+        return Form.AVX512
+    if "avx2" in features:
+        return Form.AVX2
+    return Form.SSE41 if "sse4.1" in features else Form.PORTABLE
+
+
+@functools.cache
+def rank_table(search: int, form: Form) -> npt.NDArray[np.uint16]:
+    """Return the (search, lanes) ranks of the displacements, filled up to whole vectors."""
+    displacements = _displacements(search)
+    table = np.full((search, -(-search // form.lanes) * form.lanes), 0xFFFF, np.uint16)
+    column, row = displacements.T + search // 2
+    table[row, column] = np.arange(len(displacements))
+    table.flags.writeable = False
+    return table
+
+
+def _at_cache_line(count: int) -> npt.NDArray[np.uint16]:
+    """Return space for so many numbers that starts at a cache line: vectors then lie in one."""
+    space = np.empty(count + 32, np.uint16)
+    return space[-space.ctypes.data % 64 // 2 :][:count]
 
 
 def _images(first: Bytes, second: Bytes) -> tuple[Bytes, Bytes]:

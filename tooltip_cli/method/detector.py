@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from tooltip_cli.method.affine import fit_background
-from tooltip_cli.method.blocks import match_blocks, matchable
+from tooltip_cli.method.blocks import match_blocks, window_margin
+from tooltip_cli.method.canny import edge_points
 from tooltip_cli.method.types import Array, TipPixels
 
 Image = npt.NDArray[np.uint8]
@@ -83,30 +85,33 @@ class Detections:
 
 
 def find_edges(image: Image, params: DetectorParams) -> Edges:
-    """Return (N, 2) Canny edge points (u, v), in row-major order.
+    """Return the (N, 2) Canny edge points (u, v) that can be matched, in row-major order.
 
     Args:
         image: (H, W) gray.
     """
-    import cv2
+    margin = window_margin(params.block, params.search)
+    return edge_points(image, params.canny_low, params.canny_high, margin)
 
-    points = cv2.findNonZero(cv2.Canny(image, params.canny_low, params.canny_high))
-    if points is None:  # OpenCV's word for no edge at all, e.g. in darkness
-        return np.zeros((0, 2), dtype=np.int32)
-    return np.asarray(points, dtype=np.int32).reshape(-1, 2)
+
+def _not_asked(step: str) -> None:
+    """Nobody wants to know that a step has ended."""
 
 
 def edge_motion(
-    first: Image, second: Image, edges: Edges, params: DetectorParams
+    first: Image,
+    second: Image,
+    edges: Edges,
+    params: DetectorParams,
+    lap: Callable[[str], None] = _not_asked,
 ) -> EdgeMotion | str:
     """Return the weighted edge map, or the flag that says why there is none.
 
     Args:
         first: (H, W) gray I_1; ``second``: I_2 of the same shape.
-        edges: (N, 2) edge points of ``first``.
+        edges: (N, 2) edge points of ``first``, see `find_edges`.
+        lap: told the name of each step when it ends: ``match``, ``fit``.
     """
-    inside = matchable(edges, first.shape, params.block, params.search)
-    edges = np.ascontiguousarray(edges[inside])
     if len(edges) < params.min_edges:
         return FEW_EDGES
     matches = match_blocks(
@@ -118,6 +123,7 @@ def edge_motion(
         tau=params.tau,
         alpha=params.alpha,
     )
+    lap("match")
     fit = fit_background(
         edges,
         matches.translations,
@@ -125,6 +131,7 @@ def edge_motion(
         iterations=params.drop_iterations,
         drop_fraction=params.drop_fraction,
     )
+    lap("fit")
     if fit is None:
         return SINGULAR
     return EdgeMotion(
@@ -132,9 +139,18 @@ def edge_motion(
     )
 
 
-def detect_tip(first: Image, second: Image, edges: Edges, params: DetectorParams) -> TipDetection:
-    """Select the heaviest edge of a pair of images; the first in row-major order of equals."""
-    motion = edge_motion(first, second, edges, params)
+def detect_tip(
+    first: Image,
+    second: Image,
+    edges: Edges,
+    params: DetectorParams,
+    lap: Callable[[str], None] = _not_asked,
+) -> TipDetection:
+    """Select the heaviest edge of a pair of images; the first in row-major order of equals.
+
+    Args are those of `edge_motion`.
+    """
+    motion = edge_motion(first, second, edges, params, lap)
     if isinstance(motion, str):
         nothing = np.full(2, np.nan)
         return TipDetection(nothing, 0.0, np.full((2, 3), np.nan), len(edges), 0, (motion,))
@@ -146,6 +162,6 @@ def detect_tip(first: Image, second: Image, edges: Edges, params: DetectorParams
         weight,
         motion.affine,
         len(motion.edges),
-        int(motion.background.sum()),
+        int(np.count_nonzero(motion.background)),
         () if moving else (NO_MOTION,),
     )

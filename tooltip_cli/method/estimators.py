@@ -11,7 +11,7 @@ from tooltip_cli.errors import TooltipError, one_of
 from tooltip_cli.method import generative
 from tooltip_cli.method.generative import MixtureFit, Observations
 from tooltip_cli.method.kmeans import Clusters, kmeans, lloyd
-from tooltip_cli.method.rays import angular_spread, intersections, plausible
+from tooltip_cli.method.rays import Pairs, angular_spread, intersections, plausible
 from tooltip_cli.method.types import (
     Array,
     Candidate,
@@ -34,7 +34,10 @@ class EstimatorParams:
     max_range: float = 3.0  # metres from the hand (3.2)
     clusters: int = 8  # k (4.3)
     z_start: float = 0.05  # metres, nothing is sharp or held nearer; not in the paper
-    seed: int = 0  # of K-means' start; not in the paper
+    seed: int = 0  # of K-means' start and of the samples below; not in the paper
+    max_pairs: int = 2_000_000  # of rays, all of 2,000; more are sampled; not in the paper
+    max_views: int = 2_000  # to search appendix B's maxima in; more are sampled; not in the paper
+    max_points: int = 250_000  # intersections to cluster; more are sampled; not in the paper
     sigma_start_px: float = 10.0  # appendix B's sigma, where the fit starts; not in the paper
     sigma_min_px: float = 0.1  # bounds on the fitted sigma; not in the paper
     sigma_max_px: float = 15.0
@@ -90,12 +93,22 @@ def estimate_tip(data: EstimationInput, params: EstimatorParams) -> TipEstimate:
     return ESTIMATORS[method](data, params)
 
 
-def hypotheses(data: EstimationInput, params: EstimatorParams) -> tuple[Array, Indices]:
-    """Return the plausible intersections of all pairs of rays and the pairs' indices (3.2)."""
+def hypotheses(data: EstimationInput, params: EstimatorParams) -> tuple[Array, Pairs]:
+    """Return the plausible intersections of all pairs of rays and the pairs' indices (3.2).
+
+    Where there are more pairs or points than the parameters allow, of a seeded sample.
+    """
     points, pairs = intersections(
-        data.rays, max_distance=params.max_ray_distance, z_start=params.z_start
+        data.rays,
+        max_distance=params.max_ray_distance,
+        z_start=params.z_start,
+        max_pairs=params.max_pairs,
+        seed=params.seed,
     )
-    keep = plausible(points, data.spheres, params.max_range)
+    keep = np.flatnonzero(plausible(points, data.spheres, params.max_range))
+    if len(keep) > params.max_points:
+        rng = np.random.default_rng(params.seed)
+        keep = np.sort(rng.choice(keep, params.max_points, replace=False))
     return points[keep], pairs[keep]
 
 
@@ -110,28 +123,45 @@ def estimate_kmeans(data: EstimationInput, params: EstimatorParams) -> TipEstima
         for mean, size in zip(clusters.means, clusters.sizes, strict=True)
     )
     covariance = _jackknife(points, pairs, clusters, data.rays.frames)
+    count = len(data.rays)
+    if covariance is not None and (
+        count * (count - 1) // 2 > params.max_pairs or len(points) == params.max_points
+    ):
+        covariance += _redrawn(data, params, clusters.largest)
     return _checked("kmeans", candidates, covariance, data, params)
 
 
 def estimate_map(data: EstimationInput, params: EstimatorParams) -> TipEstimate:
-    """Appendix B: the maximum of the posterior, its covariance from the curvature there."""
+    """Appendix B: the maximum of the posterior, its covariance from the curvature there.
+
+    Of very many views a seeded sample decides between the maxima; all then decide where it lies.
+    """
     observations = data.observations()
-    fits = [
-        generative.fit_mixture(
-            observations,
+    sample = observations
+    if len(data.rays) > params.max_views:
+        rng = np.random.default_rng(params.seed)
+        sample = observations.select(rng.choice(len(data.rays), params.max_views, replace=False))
+
+    def climb(seen: Observations, start: Array, sigma_px: float, outliers: float) -> MixtureFit:
+        return generative.fit_mixture(
+            seen,
             start,
-            sigma_start_px=params.sigma_start_px,
+            sigma_start_px=sigma_px,
             sigma_min_px=params.sigma_min_px,
             sigma_max_px=params.sigma_max_px,
+            outlier_start=outliers,
         )
-        for start in _starts(data, params)
-    ]
+
+    fits = [climb(sample, start, params.sigma_start_px, 0.5) for start in _starts(data, params)]
     allowed = [
         fit for fit in fits if plausible(fit.position[None], data.spheres, params.max_range)[0]
     ]
     if not allowed:
         return refused("map", len(data.rays), _inconsistent(0, len(data.rays)))
     ranked = _distinct(sorted(allowed, key=lambda fit: -fit.log_likelihood))
+    if sample is not observations:
+        best = ranked[0]
+        ranked[0] = climb(observations, best.position, best.sigma_px, best.outlier_share)
     candidates = tuple(
         Candidate(fit.position, float(fit.responsibilities.mean())) for fit in ranked
     )
@@ -172,7 +202,7 @@ def _distinct(fits: list[MixtureFit], distance: float = 0.005) -> list[MixtureFi
 
 
 def _jackknife(
-    points: Array, pairs: Indices, clusters: Clusters, frames: Indices, groups: int = 10
+    points: Array, pairs: Pairs, clusters: Clusters, frames: Indices, groups: int = 10
 ) -> Array | None:
     """Covariance of the largest cluster's mean from leaving out a tenth of the frames in turn.
 
@@ -192,6 +222,21 @@ def _jackknife(
     deviations = np.array(means) - np.mean(means, axis=0)
     covariance: Array = (len(means) - 1) / len(means) * deviations.T @ deviations
     return covariance
+
+
+def _redrawn(data: EstimationInput, params: EstimatorParams, mean: Array, draws: int = 4) -> Array:
+    """Scatter of a cluster's mean when pairs, points and K-means' start are drawn anew.
+
+    K-means has several solutions where wrong intersections lie all around the right ones, and with
+    very many frames these differ by more than the jackknife tells.
+    """
+    offsets = []
+    for draw in range(1, draws + 1):
+        again = replace(params, seed=params.seed + draw)
+        means = kmeans(hypotheses(data, again)[0], params.clusters, again.seed).means
+        offsets.append(means[np.argmin(np.linalg.norm(means - mean, axis=1))] - mean)
+    scatter: Array = np.array(offsets).T @ np.array(offsets) / draws
+    return scatter
 
 
 def _too_little(data: EstimationInput, params: EstimatorParams) -> list[Reason]:

@@ -7,11 +7,11 @@ both are fitted together with the tip by expectation maximisation, within bounds
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tooltip_cli.method.types import Array
+from tooltip_cli.method.types import Array, Indices, Mask
 
 _EM_STEPS = 200
 _NEWTON_STEPS = 20
@@ -26,6 +26,12 @@ class Observations:
     camera_from_hand: Array  # (N, 4, 4)
     focal_px: float  # pixels per unit of normalized coordinates
     image_area_px: float  # pixels^2, the support of b
+
+    def select(self, keep: Mask | Indices) -> Observations:
+        """Return the chosen rows."""
+        return replace(
+            self, normalized=self.normalized[keep], camera_from_hand=self.camera_from_hand[keep]
+        )
 
 
 @dataclass(frozen=True)
@@ -119,13 +125,7 @@ def _expectation(
 def _weighted_least_squares(observations: Observations, position: Array, weights: Array) -> Array:
     """Minimise the weighted squared reprojection error by damped Gauss-Newton steps."""
     used = weights > 1e-12
-    weights = weights[used]
-    observations = Observations(
-        observations.normalized[used],
-        observations.camera_from_hand[used],
-        observations.focal_px,
-        observations.image_area_px,
-    )
+    weights, observations = weights[used], observations.select(used)
     damping = 1e-9
     errors, jacobian = residuals(observations, position)
     cost = float((weights * np.square(errors).sum(axis=1)).sum())

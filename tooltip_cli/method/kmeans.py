@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tooltip_cli import machine_code
 from tooltip_cli.method.types import Array, Indices
 
-_SEEDING_SAMPLE = 2048
+_SEEDING_SAMPLE = 2048  # at least
+_SEEDING_SHARE = 40  # of more than 40 * 2048 points, one in 40
 _SEEDING_RUNS = 8
 _MAX_ITERATIONS = 300
 _BLOCK = 1 << 16
@@ -47,8 +49,9 @@ def kmeans(points: Array, k: int, seed: int) -> Clusters:
     rng = np.random.default_rng(seed)
     k = min(k, len(points))
     sample = ordered
-    if len(ordered) > _SEEDING_SAMPLE:
-        sample = ordered[np.sort(rng.choice(len(ordered), _SEEDING_SAMPLE, replace=False))]
+    wanted = max(_SEEDING_SAMPLE, len(ordered) // _SEEDING_SHARE)
+    if len(ordered) > wanted:
+        sample = ordered[np.sort(rng.choice(len(ordered), wanted, replace=False))]
     runs = [lloyd(sample, _plus_plus(sample, k, rng)) for _ in range(_SEEDING_RUNS)]
     start = min(runs, key=lambda run: _inertia(sample, *run))[0]
     means, labels = lloyd(ordered, start)
@@ -61,16 +64,48 @@ def kmeans(points: Array, k: int, seed: int) -> Clusters:
     return Clusters(means[rank], unordered, sizes[rank].astype(np.intp))
 
 
-def lloyd(points: Array, means: Array) -> tuple[Array, Indices]:
+def lloyd(points: Array, means: Array, use_numba: bool | None = None) -> tuple[Array, Indices]:
     """Iterate assignment and mean until nothing changes; a mean that loses all stays put.
 
     Args:
         points: (M, D).
         means: (K, D) where to start.
+        use_numba: whether to run the compiled form; None takes it where there is one. Both forms
+            give exactly the same.
 
     Returns:
         (K, D) means and (M,) labels.
     """
+    return machine_code.fast_or_slow(
+        lambda: _lloyd_compiled(points, means), lambda: _lloyd_numpy(points, means), use_numba
+    )
+
+
+def _lloyd_compiled(points: Array, means: Array) -> tuple[Array, Indices]:
+    count, dimensions = points.shape
+    cluster = machine_code.kernel(
+        "tooltip_cli.method._kmeans_numba",
+        "clusterer",
+        "f64* i64 i64 i64 f64* i64* f64* i64* i64* f64*",
+        dimensions,
+    )
+    moved, labels = np.array(means, np.float64), np.full(count, -1, np.int64)
+    cluster(
+        np.ascontiguousarray(points.T, np.float64),
+        count,
+        len(means),
+        _MAX_ITERATIONS,
+        moved,
+        labels,
+        np.empty(512),
+        np.empty(512, np.int64),
+        np.empty(len(means), np.int64),
+        np.empty(means.shape),
+    )
+    return moved, labels.astype(np.intp, copy=False)
+
+
+def _lloyd_numpy(points: Array, means: Array) -> tuple[Array, Indices]:
     labels = nearest(points, means)
     for _ in range(_MAX_ITERATIONS):
         sizes = np.bincount(labels, minlength=len(means))

@@ -26,6 +26,7 @@ from tooltip_cli.stages.artifacts import (
     provenance,
     stage_key,
 )
+from tooltip_cli.stages.clock import laps
 from tooltip_cli.stages.threads import in_order
 
 SUFFIX = ".detections.mcap"
@@ -103,6 +104,7 @@ def detect_in(
     for row in _detect_pairs(recording, params, jobs):
         rows.append(row)
         on_pair()
+    lap = laps()
     detections = _table(rows)
     write_detections(
         path,
@@ -111,6 +113,7 @@ def detect_in(
         recording.image_frame,
         provenance(recording.path, recording.sha256, key, params),
     )
+    lap("write")
     return Detected(path, key, False, detections)
 
 
@@ -136,11 +139,15 @@ def _detect_pairs(
 
 def _detect_chunk(recording: Recording, params: DetectorParams, start: int) -> list[TipDetection]:
     stop = min(start + _PAIRS_A_TASK, len(recording.image_stamps_ns) - 1)
+    lap = laps()
     images = recording.images(range(start, stop + 1), gray=True)
     first = next(images)
     rows = []
     for second in images:
-        rows.append(detect_tip(first, second, find_edges(first, params), params))
+        lap("decode")
+        edges = find_edges(first, params)
+        lap("edges")
+        rows.append(detect_tip(first, second, edges, params, lap))
         first = second
     return rows
 

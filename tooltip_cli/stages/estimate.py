@@ -48,6 +48,7 @@ from tooltip_cli.stages.calibrate import (
     refinement_document,
     refinement_from_document,
 )
+from tooltip_cli.stages.clock import laps
 from tooltip_cli.stages.detect import Detected, detect_in
 from tooltip_cli.stages.held_out import unlabelled
 from tooltip_cli.stages.moving import VERSION as EDGES_VERSION
@@ -100,9 +101,12 @@ def estimate(
     Raises:
         TooltipError: anything wrong with the inputs.
     """
+    lap = laps()
     recording = read_recording(recording_path, topics or Topics())
+    lap("read")
     resolved = resolve_rig(recording, rig)
     views = resolve_views(recording, resolved)
+    lap("poses")
     params = params or EstimatorParams()
     if from_labels is not None:
         labels = match_labels(read_labels(from_labels), recording.image_stamps_ns, views.camera)
@@ -220,7 +224,10 @@ def estimate_from_detections(
     def compute() -> TipEstimate:
         if not len(pixels.frames):
             return refused(params.method, 0, _nothing_detected(detected.detections))
-        return estimate_tip(estimation_input(views, pixels), params)
+        lap = laps()
+        result = estimate_tip(estimation_input(views, pixels), params)
+        lap("estimate")
+        return result
 
     return Estimated(*_estimate(recording, views, compute, parents, params, out, force), detected)
 
@@ -258,7 +265,10 @@ def estimate_from_labels(
         if not len(pixels.frames):
             reason = Reason("no_labels", "no label shows the tip; label frames in which it is seen")
             return refused(params.method, 0, reason)
-        return estimate_tip(estimation_input(views, pixels), params)
+        lap = laps()
+        result = estimate_tip(estimation_input(views, pixels), params)
+        lap("estimate")
+        return result
 
     return Estimated(*_estimate(recording, views, compute, parents, params, out, force), None)
 
@@ -282,9 +292,11 @@ def _estimate(
             if stored is not None:
                 return place, key, True, *stored
     result = compute()
+    lap = laps()
     document = tip_document(result, provenance(recording.path, recording.sha256, key, settings))
     path = artifact_path(recording.path, SUFFIX, out)
     write_whole(path, json.dumps(document, indent=1) + "\n")
+    lap("write")
     return path, key, False, result, document
 
 

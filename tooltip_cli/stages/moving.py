@@ -36,6 +36,7 @@ from tooltip_cli.stages.artifacts import (
     provenance,
     stage_key,
 )
+from tooltip_cli.stages.clock import laps
 from tooltip_cli.stages.threads import in_order
 
 SUFFIX = ".edges.mcap"
@@ -93,6 +94,7 @@ def detect_edges_in(
             if stored is not None:
                 return DetectedEdges(place, key, True, stored)
     edges = find_moving_edges(recording, views, pairing, params, jobs, on_frame)
+    lap = laps()
     path = artifact_path(recording.path, SUFFIX, out)
     ensure_directory(path.parent)
     write_edges(
@@ -102,6 +104,7 @@ def detect_edges_in(
         recording.image_frame,
         provenance(recording.path, recording.sha256, key, params),
     )
+    lap("write")
     return DetectedEdges(path, key, False, edges)
 
 
@@ -126,7 +129,9 @@ def find_moving_edges(
     on_frame: Callable[[], None],
 ) -> MovingEdges:
     """Find the moving edges of all chosen frames; the result does not depend on ``jobs``."""
+    lap = laps()
     noise = _noise(recording, pairing)
+    lap("decode")
     parts: list[FrameEdges] = []
     starts = range(0, len(pairing.frames), _FRAMES_A_TASK)
 
@@ -158,11 +163,14 @@ def _chunk(
     frames = pairing.frames[start : start + _FRAMES_A_TASK]
     partners = pairing.partners[start : start + _FRAMES_A_TASK]
     needed = np.unique(np.concatenate([frames, partners.ravel()]))
+    lap = laps()
     images: dict[int, Image] = {}
     for index, image in zip(needed, recording.images(needed, gray=True), strict=True):
+        lap("decode")
         images[int(index)] = smooth(image, params)
+        lap("moving edges")
     centres, radii = hand_in_image(views, frames, params.reach)
-    return [
+    found = [
         moving_edges(
             images[int(frame)],
             (images[int(before)], images[int(after)]),
@@ -175,6 +183,8 @@ def _chunk(
             frames, partners, centres, radii, strict=True
         )
     ]
+    lap("moving edges")
+    return found
 
 
 def hand_in_image(views: Views, frames: Indices, reach: float) -> tuple[Array, Array]:

@@ -4,9 +4,12 @@ Example:
     python tests/benchmarks/accuracy/run.py --work /tmp/accuracy --seeds 0 1 2 3 4
     python tests/benchmarks/accuracy/run.py --work /tmp/accuracy --perturb noise half 15hz
     python tests/benchmarks/accuracy/run.py --work /tmp/accuracy --recordings DIR/*.mcap
+    python tests/benchmarks/accuracy/run.py --work /tmp/accuracy --methods voting voting+all --wrong
 
 Simulated recordings are made once under ``--work`` and reused. A given recording needs
 STEM.labels.csv and, where it does not carry them, STEM.rig.yaml and STEM.truth.json beside it.
+``voting+time`` and ``voting+all`` are voting with ``--refine``; the tip is then projected by the
+refined rig. ``--wrong`` makes every rig wrong: 1 degree, 5 mm and 30 ms.
 """
 
 from __future__ import annotations
@@ -25,9 +28,10 @@ from tooltip_cli.log.recording import read_recording
 from tooltip_cli.log.views import Views, resolve_rig, resolve_views
 from tooltip_cli.method.estimators import EstimatorParams
 from tooltip_cli.method.evaluation import pixel_errors
-from tooltip_cli.method.types import Array, TipEstimate, TipPixels
+from tooltip_cli.method.types import Array, Correction, TipEstimate, TipPixels
 from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.sources.sim import TOOLS, SimParams
+from tooltip_cli.stages.calibrate import put_right
 from tooltip_cli.stages.estimate import estimate_from_images, estimate_from_labels
 from tooltip_cli.stages.held_out import unlabelled
 from tooltip_cli.stages.simulate import reuse_simulation
@@ -48,6 +52,7 @@ PERTURBATIONS: dict[str, dict[str, Any]] = {
     "in_plane": {"motion": "in_plane"},
     "still": {"motion": "still"},
 }
+WRONG = Correction(0.03, np.radians([0.68, -0.57, 0.46]), np.array([0.0030, -0.0030, 0.0027]))
 CHI2_95 = 7.815  # three degrees of freedom
 
 
@@ -58,6 +63,7 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--perturb", nargs="+", default=["none"], choices=list(PERTURBATIONS))
     parser.add_argument("--methods", nargs="+", default=["voting", "kmeans"])
+    parser.add_argument("--wrong", action="store_true", help="make every rig wrong")
     parser.add_argument("--recordings", nargs="*", type=Path, default=[])
     arguments = parser.parse_args()
     rows = []
@@ -66,7 +72,8 @@ def main() -> None:
     if not arguments.recordings:
         cases = list(_simulated(arguments))
     for path, rig, group in cases:
-        for row in _score(path, rig, arguments.methods, arguments.work / "results"):
+        out = arguments.work / "results"
+        for row in _score(path, rig, arguments.methods, out, arguments.wrong):
             rows.append({"group": group, **row})
             print(_line(rows[-1]), flush=True)
     (arguments.work / "accuracy.json").write_text(json.dumps(rows, indent=1))
@@ -93,9 +100,14 @@ def _simulated(arguments: argparse.Namespace) -> Any:
                 yield reuse_simulation(params, path, jobs=2).recording, None, perturbation
 
 
-def _score(path: Path, rig: Path | None, methods: list[str], out: Path) -> list[dict[str, Any]]:
+def _score(
+    path: Path, rig_path: Path | None, methods: list[str], out: Path, wrong: bool
+) -> list[dict[str, Any]]:
     recording = read_recording(path)
-    views = resolve_views(recording, resolve_rig(recording, rig))
+    rig = resolve_rig(recording, rig_path)
+    if wrong:
+        rig = put_right(recording, rig, WRONG)
+    views = resolve_views(recording, rig)
     labels = match_labels(
         read_labels(path.with_suffix(".labels.csv")), recording.image_stamps_ns, views.camera
     )
@@ -108,16 +120,23 @@ def _score(path: Path, rig: Path | None, methods: list[str], out: Path) -> list[
     ]
     for method in methods:
         start = time.perf_counter()
+        name, _, what = method.partition("+")
         found = estimate_from_images(
             recording,
             views,
-            EstimatorParams(method=method),
+            EstimatorParams(method=name),
             unlabelled(recording, views.camera, None),
+            refine=(rig, what) if what else None,
             out=out / method,
             force=True,
         ).estimate
         row = {"name": path.stem, "method": method, "seconds": time.perf_counter() - start}
-        rows.append({**row, **_errors(found, views, labels.visible, truth)})
+        refined, seen_by = found.refinement, views
+        if refined is not None:
+            row["offset_ms"] = 1000 * refined.correction.time_offset
+            if refined.applied:
+                seen_by = resolve_views(recording, put_right(recording, rig, refined.correction))
+        rows.append({**row, **_errors(found, seen_by, labels.visible, truth)})
     return rows
 
 
@@ -155,14 +174,16 @@ def _mean_px(place: Array, views: Views, labels: TipPixels) -> float:
 
 def _line(row: dict[str, Any]) -> str:
     numbers = "".join(
-        f" {name} {row[name]:6.2f}" for name in ("px", "mm", "nearest_px", "seconds") if name in row
+        f" {name} {row[name]:6.2f}"
+        for name in ("px", "mm", "nearest_px", "seconds", "offset_ms")
+        if name in row
     )
-    return f"{row['name']:32} {row['method']:8}{numbers} {row['status']} {' '.join(row['codes'])}"
+    return f"{row['name']:32} {row['method']:12}{numbers} {row['status']} {' '.join(row['codes'])}"
 
 
 def _summary(group: str, method: str, rows: list[dict[str, Any]]) -> None:
     answered = [row for row in rows if "px" in row]
-    text = f"{group:10} {method:8} {len(answered)} of {len(rows)} answered"
+    text = f"{group:10} {method:12} {len(answered)} of {len(rows)} answered"
     for name in ("px", "nearest_px", "mm", "nearest_mm"):
         values = [row[name] for row in answered if name in row]
         if values:

@@ -32,14 +32,12 @@ import numpy.typing as npt
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from tooltip_cli.method import _blocks_numba, blocks
+from tooltip_cli.method import blocks
 from tooltip_cli.method.affine import fit_background
-from tooltip_cli.method.blocks import BlockMatches, match_blocks, matchable
+from tooltip_cli.method.blocks import BlockMatches, Form, match_blocks, matchable
 
 Image = npt.NDArray[np.uint8]
 Pixels = npt.NDArray[np.int32]
-
-FORMS = {16: "mpsadbw, AVX2", 8: "mpsadbw, SSE4.1", 0: "portable vectors"}
 
 
 def frames(recording: Path, count: int) -> list[Image]:
@@ -93,9 +91,8 @@ def main() -> None:
     contestants: dict[str, Callable[[Image, Image, Pixels], object]] = {
         "match_blocks": match_blocks
     }
-    for lanes in (16, 8, 0):
-        if lanes <= _blocks_numba.mpsadbw_lanes():
-            contestants[FORMS[lanes]] = functools.partial(compiled, lanes)
+    for form in range(blocks.best_form(), -1, -1):
+        contestants[f"form {Form(form).name}"] = functools.partial(compiled, Form(form))
     reference = load_reference(options.reference) if options.reference else None
     if reference is not None:
         contestants["reference"] = reference
@@ -133,8 +130,8 @@ def main() -> None:
         print(f"{name:28s} {median:8.4f} us/edge {median / ours:6.2f} of match_blocks")
 
 
-def compiled(lanes: int, first: Image, second: Image, edges: Pixels) -> BlockMatches:
-    return blocks._match_compiled(first, second, edges, 5, 11, 199, 0.25, None, lanes)
+def compiled(form: Form, first: Image, second: Image, edges: Pixels) -> BlockMatches:
+    return blocks._match_compiled(first, second, edges, 5, 11, 199, 0.25, None, form)
 
 
 if __name__ == "__main__":

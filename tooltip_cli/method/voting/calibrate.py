@@ -114,7 +114,7 @@ def _solved(
         float(np.mean([0.0 if fit is None else fit.support(refine) for fit in group]))
         for group in (start, fits)
     )
-    certain = len(sigmas) > 1 or abs(values[0]) > params.certain * deviations[0]
+    certain = len(sigmas) > 1 or bool(abs(values[0]) > params.certain * deviations[0])
     helps = determined > 0 and certain and after > before
     return Refinement(_correction(values), deviations, helps, before, after)
 

@@ -63,14 +63,18 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     cloud = reconstruct(edges, settings.voting)
     shape = tool_shape(cloud, spheres, edges.reach, settings.end)
     trust = settings.trust
-    if cloud.score < trust.min_score or cloud.consistent < trust.min_consistent:
+    if cloud.score < trust.min_score:
         return refused(METHOD, used, _nothing_consistent(cloud))
     if not len(shape.voxels):
-        return refused(METHOD, used, _only_the_hand())
-    candidates = [
+        clutter = cloud.consistent < trust.min_consistent
+        return refused(METHOD, used, _nothing_consistent(cloud) if clutter else _only_the_hand())
+    found = [
         _candidate(edges, cloud, shape, shape.voxels[far], spheres, settings)
         for far in far_voxels(shape, settings.end)
     ]
+    if cloud.consistent < trust.min_consistent and found[0][1] < trust.convincing_agreement:
+        return refused(METHOD, used, _nothing_consistent(cloud))
+    candidates = [candidate for candidate, _ in found]
     least = settings.end.other_end_support * candidates[0].support
     candidates = [item for item in candidates if item.support >= least]
     if settings.prefer is not None:
@@ -107,17 +111,24 @@ def _candidate(
     far: Array,
     spheres: Array,
     settings: VotingSettings,
-) -> Candidate:
-    """Return the end that a far voxel (3,) lies on, put right by the images where they agree."""
+) -> tuple[Candidate, float]:
+    """Return the end that a far voxel (3,) lies on, put right by the images where they agree.
+
+    Returns:
+        the end, and the share of the images that agree on it; 0: too few for that.
+    """
     end = locate_end(cloud, shape, far, spheres, settings.end)
     refined = refine_end(
         edges, cloud, end.position, end.axis, end.radius, settings.refine, settings.trust.seed
     )
     if refined is None:
         covariance = _voted_covariance(cloud, end, far, spheres, edges.reach, settings)
-        return Candidate(end.position, end.support, covariance, end.axis)
+        return Candidate(end.position, end.support, covariance, end.axis), 0.0
     covariance, axis_variance = _uncertainty(refined, settings.trust)
-    return Candidate(refined.position, end.support, covariance, refined.axis, axis_variance**0.5)
+    candidate = Candidate(
+        refined.position, end.support, covariance, refined.axis, axis_variance**0.5
+    )
+    return candidate, refined.agreement
 
 
 def _uncertainty(end: RefinedEnd, trust: TrustParams) -> tuple[Array, float]:

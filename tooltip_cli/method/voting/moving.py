@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tooltip_cli.method.affine import fit_background, mahalanobis
-from tooltip_cli.method.blocks import match_blocks, matchable
+from tooltip_cli.method.blocks import match_blocks, window_margin
+from tooltip_cli.method.canny import edge_points
 from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.params import MovingParams
 
@@ -102,24 +103,23 @@ def moving_edges(
         hand_radius_px: how far from there the tool can reach.
         noise: of the raw images, grey levels.
     """
-    import cv2
-
     low = params.canny_low * max(noise, 1.0)
-    found = cv2.findNonZero(cv2.Canny(image, low, low * params.canny_ratio))
-    edges = np.zeros((0, 2), np.int32) if found is None else found.reshape(-1, 2)
-    edges = edges[matchable(edges, image.shape, params.block, params.search)]
+    margin = window_margin(params.block, params.search)
+    edges = edge_points(image, low, low * params.canny_ratio, margin)
     affines = np.full((2, 2, 3), np.nan)
     if len(edges) < _FLAT:
         return _nothing(affines)
-    near = np.square(edges - hand_pixel).sum(axis=1) < hand_radius_px**2
-    changed = np.zeros(len(edges), dtype=bool)
+    du, dv = (edges - hand_pixel).T
+    near = edges[du * du + dv * dv < hand_radius_px**2]
+    changed = np.zeros(len(near), dtype=bool)
+    sample = _sample(edges, params)
     for side, other in enumerate(others):
-        model = _background(image, other, edges, params)
+        model = _background(image, other, sample, params)
         if model is None:
             return _nothing(affines)
         affines[side] = model
-        changed |= _changed(image, other, model, noise, params)[edges[:, 1], edges[:, 0]]
-    edges = np.ascontiguousarray(edges[near & changed])
+        changed |= _changed(image, other, model, noise, params)[near[:, 1], near[:, 0]]
+    edges = np.ascontiguousarray(near[changed])
     matches = [
         match_blocks(
             image,
@@ -145,15 +145,19 @@ def moving_edges(
     )
 
 
+def _sample(edges: npt.NDArray[np.int32], params: MovingParams) -> npt.NDArray[np.int32]:
+    """Return a seeded sample of all edges."""
+    if len(edges) <= params.background_edges:
+        return edges
+    rng = np.random.default_rng(params.seed)
+    rows = rng.choice(len(edges), params.background_edges, replace=False)
+    return np.ascontiguousarray(edges[np.sort(rows)])
+
+
 def _background(
-    image: Image, other: Image, edges: npt.NDArray[np.int32], params: MovingParams
+    image: Image, other: Image, sample: npt.NDArray[np.int32], params: MovingParams
 ) -> Array | None:
-    """Fit the background's affine motion to a seeded sample of all edges."""
-    sample = edges
-    if len(edges) > params.background_edges:
-        rng = np.random.default_rng(params.seed)
-        rows = rng.choice(len(edges), params.background_edges, replace=False)
-        sample = np.ascontiguousarray(edges[np.sort(rows)])
+    """Fit the background's affine motion to a sample of all edges."""
     matches = match_blocks(
         image,
         other,
