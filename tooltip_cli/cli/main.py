@@ -74,6 +74,7 @@ def main(verbose: bool) -> None:
     """
     # OpenCV would print its own lines about damaged images beside ours; read when it is imported
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # and FFmpeg's about lost streams
     # and decode a gigapixel that a file of a kilobyte claims
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**25))
     # small products only: threads of the linear algebra would spin, and round differently
