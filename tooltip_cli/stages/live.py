@@ -110,11 +110,11 @@ def record_live(
             recorder.run(writer, out)
         except LowDiskError as error:
             low = error
-        recorder.close()
         if not source.report.read.get(source.image_topic):
             writer.discard()
-            reasons = "; ".join(recorder.ends) or "nothing was heard"
+            reasons = "; ".join(recorder.ends) or "it was stopped before"
             raise TooltipError(f"{out} was not written, for no image came: {reasons}")
+        recorder.close()
     if low is not None:
         raise low
     return Recorded(out, source.report)
