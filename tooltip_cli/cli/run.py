@@ -130,6 +130,7 @@ def run(
     """
     from tooltip_cli.log.recording import Topics
     from tooltip_cli.method.estimators import EstimatorParams
+    from tooltip_cli.stages.artifacts import ensure_directory
     from tooltip_cli.stages.shelf.plan import part_of, read_shelf
     from tooltip_cli.stages.shelf.run import plan_run
 
@@ -149,6 +150,7 @@ def run(
         force=force,
         verify=verify,
     )
+    ensure_directory(out)  # before any work
     engine = _engine(dask, jobs, _memory(memory, jobs))
     rows = _carry_out(plan, engine, jobs, out / name, say if as_json else click.echo)
     if as_json:
