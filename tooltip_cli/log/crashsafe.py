@@ -44,7 +44,8 @@ class CrashSafeWriter(MessageWriter):
         path: the name of the finished file.
         overwrite: replace ``path``, when finished, where it exists.
         min_free_bytes: stop before the disk has less than this left.
-        flush_every_s: longest time that a message waits in memory, seconds.
+        flush_every_s: longest time that a message waits in memory, seconds; None: chunks go by
+            size alone, so that equal messages give equal bytes.
 
     Raises:
         TooltipError: the file exists and ``overwrite`` is false, or the disk takes no more.
@@ -59,7 +60,7 @@ class CrashSafeWriter(MessageWriter):
         *,
         overwrite: bool = False,
         min_free_bytes: int = MIN_FREE_BYTES,
-        flush_every_s: float = FLUSH_EVERY_S,
+        flush_every_s: float | None = FLUSH_EVERY_S,
     ) -> None:
         super().__init__(path, overwrite=overwrite)
         self._overwrite = overwrite

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tooltip_cli.errors import StoppedError, TooltipError
-from tooltip_cli.log.crashsafe import MIN_FREE_BYTES, CrashSafeWriter, leftovers
+from tooltip_cli.log.crashsafe import FLUSH_EVERY_S, MIN_FREE_BYTES, CrashSafeWriter, leftovers
 from tooltip_cli.log.messages import Message
 from tooltip_cli.log.stopping import Stop
 from tooltip_cli.rig.rigfile import Rig, rig_files
@@ -35,6 +35,7 @@ def record(
     rig: Rig | None = None,
     overwrite: bool = False,
     min_free_bytes: int = MIN_FREE_BYTES,
+    flush_every_s: float | None = FLUSH_EVERY_S,
     stop: Stop | None = None,
     keep_unfinished: bool = True,
     on_image: Callable[[], None] = lambda: None,
@@ -63,7 +64,9 @@ def record(
         )
     images = 0
     rig = rig or source.rig
-    with CrashSafeWriter(out, overwrite=overwrite, min_free_bytes=min_free_bytes) as writer:
+    with CrashSafeWriter(
+        out, overwrite=overwrite, min_free_bytes=min_free_bytes, flush_every_s=flush_every_s
+    ) as writer:
         try:
             # first, so that they are in whatever part of the file survives
             if rig is not None:

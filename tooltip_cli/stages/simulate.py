@@ -64,6 +64,7 @@ def record_simulation(
         out,
         overwrite=overwrite,
         min_free_bytes=min_free_bytes,
+        flush_every_s=None,  # equal parameters give equal bytes, however busy the machine is
         stop=stop,
         keep_unfinished=keep_unfinished,
         on_image=on_image,
