@@ -349,9 +349,13 @@ def test_sizes_are_read(
     seen: list[int] = []
 
     class Spy(CrashSafeWriter):
-        def __init__(self, path: Path, *, overwrite: bool, min_free_bytes: int) -> None:
+        def __init__(
+            self, path: Path, *, overwrite: bool, min_free_bytes: int, flush_every_s: float | None
+        ) -> None:
             seen.append(min_free_bytes)
-            super().__init__(path, overwrite=overwrite, min_free_bytes=0)
+            super().__init__(
+                path, overwrite=overwrite, min_free_bytes=0, flush_every_s=flush_every_s
+            )
 
     monkeypatch.setattr("tooltip_cli.stages.record.CrashSafeWriter", Spy)
     done = tooltip("record", "bag", wrist_file, tmp_path / "a.mcap", "--min-free", text)
