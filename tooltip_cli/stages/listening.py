@@ -96,7 +96,9 @@ class Listening:
         topic = self._source.image_topic
         if self._reconnect or time.monotonic() - self._heard[topic].since <= patience_s:
             return False
-        self.ends.append(f"no image on {topic} for {patience_s:.0f} s")
+        reason = f"no image on {topic} for {patience_s:.0f} s"
+        if reason not in self.ends:
+            self.ends.append(reason)
         return True
 
     def streams(self) -> list[StreamStatus]:

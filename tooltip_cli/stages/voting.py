@@ -28,7 +28,7 @@ def pair_views(
 ) -> tuple[Pairing, Array]:
     """Return the pairing of a recording's images and (N, 4, 4) camera_from_hand."""
     camera_from_hand = inverse_transform(views.hand_from_camera)
-    return pair_frames(camera_from_hand, _focal(views.camera), settings.pairing, allowed), (
+    return pair_frames(camera_from_hand, focal_px(views.camera), settings.pairing, allowed), (
         camera_from_hand
     )
 
@@ -115,7 +115,7 @@ def hand_edges(
         _normalized(camera, pixels[:, None] + moving.translations),
         _normalized(camera, carried),
         camera_from_hand,
-        _focal(camera),
+        focal_px(camera),
         image_extent(camera),
         settings.moving.reach,
     )
@@ -126,5 +126,6 @@ def _normalized(camera: CameraModel, pixels: Array) -> Array:
     return np.asarray(rays[..., :2] / rays[..., 2:])
 
 
-def _focal(camera: CameraModel) -> float:
+def focal_px(camera: CameraModel) -> float:
+    """Return ideal pixels per unit of normalized coordinates."""
     return float(np.sqrt(camera.fx * camera.fy))
