@@ -135,6 +135,23 @@ domain_option = click.option(
 )
 
 
+def ros2_source(
+    image: str | None,
+    joints: str | None,
+    info: str | None,
+    pose: str | None,
+    domain: int,
+    rig: Path | None,
+    robot: Path | None,
+) -> LiveSource:
+    """Return the source that ``topic_options``, ``domain_option`` and ``rig_options`` name."""
+    from tooltip_cli.log.recording import Topics
+    from tooltip_cli.sources.ros2 import Ros2Source
+
+    topics = Topics(image, joints, info, pose)
+    return Ros2Source(domain, topics, load_rig_file(rig), load_urdf(robot))
+
+
 @click.command("camera", short_help="Record a camera and joints without ROS.")
 @out_argument
 @camera_options
@@ -215,12 +232,9 @@ def ros2(
       tooltip record ros2 pliers.mcap --duration 15 --rig rig.yaml
       tooltip record ros2 pliers.mcap --image /head/image_raw/compressed --domain 7
     """
-    from tooltip_cli.log.recording import Topics
-    from tooltip_cli.sources.ros2 import Ros2Source
     from tooltip_cli.stages.live import LiveOptions
 
-    topics = Topics(image, joints, info, pose)
-    source = Ros2Source(domain, topics, load_rig_file(rig), load_urdf(robot))
+    source = ros2_source(image, joints, info, pose, domain, rig, robot)
     options = LiveOptions(duration, until_enough, reconnect, patience, queue, min_free)
     _record(source, out, options, force, as_json)
 

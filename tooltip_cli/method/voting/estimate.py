@@ -126,7 +126,12 @@ def _candidate(
         return Candidate(end.position, end.support, covariance, end.axis), 0.0
     covariance, axis_variance = _uncertainty(refined, settings.trust)
     candidate = Candidate(
-        refined.position, end.support, covariance, refined.axis, axis_variance**0.5
+        refined.position,
+        end.support,
+        covariance,
+        refined.axis,
+        axis_variance**0.5,
+        refined.agreement,
     )
     return candidate, refined.agreement
 
