@@ -53,14 +53,14 @@ class SourceGroup(click.Group):
 def watch() -> None:
     """Estimate the tip while images arrive.
 
-    The same estimate as 'tooltip estimate', from at most 200 images that are spread over the hand's
-    orientations as they come, made again about every second: position with its uncertainty, the
-    share of the images that agree, the delay, and what motion would help. It ends with the recording,
-    at Ctrl-C or with --until-enough, and then gives the last estimate; it exits with 3 when that
-    cannot be trusted.
+    The same estimate as 'tooltip estimate', from at most 200 images that are spread over the
+    hand's orientations as they come, made again every second or few: position with its
+    uncertainty, the share of the images that agree, the delay, and what motion would help. It
+    ends with the recording, at Ctrl-C or with --until-enough, and then gives the last estimate;
+    it exits with 3 when that cannot be trusted.
 
-    REC is a recording, which is played; 'tooltip watch recording --help' shows its options. SOURCE is
-    a robot, named and described as for 'tooltip record'.
+    REC is a recording, which is played; 'tooltip watch recording --help' shows its options.
+    SOURCE is a robot, named and described as for 'tooltip record'.
 
     \b
     Examples:
@@ -75,7 +75,7 @@ def _watch_options(command: _Command) -> _Command:
     """Add what all sources have in common."""
     for option in (
         click.option(
-            "--json", "as_json", is_flag=True, help="Print every update as a line of JSON."
+            "--json", "as_json", is_flag=True, help="Print each update as a line of JSON."
         ),
         click.option("--force", is_flag=True, help="Replace the file under --out if it exists."),
         click.option(
@@ -96,7 +96,7 @@ def _watch_options(command: _Command) -> _Command:
             default=1.0,
             show_default=True,
             metavar="SECONDS",
-            help="Shortest time from one estimate to the next; a busy or slow machine takes longer.",
+            help="Shortest time from one estimate to the next; a busy machine takes longer.",
         ),
     ):
         command = option(command)

@@ -74,7 +74,8 @@ class Update:
     time_s: float  # between the first image and the last that was taken into account
     stamp_ns: int  # of the latter
     delay_s: float  # from the arrival of the latter to this estimate
-    compute_s: float
+    compute_s: float  # that the estimate took
+    behind_s: float  # longest since the last update from an image's arrival to its being taken
     counts: Counts
     verdict: Verdict | None  # on the motion
     final: bool
@@ -173,7 +174,7 @@ class _Watch:
         self._keeper = FrameKeeper(rig, settings, left_out)
         self._motion: MotionWatch | None = None
         self._verdict: Verdict | None = None
-        self._judged = 0.0
+        self._judged = self._behind_s = 0.0
         self._images = 0
         self._first_image: float | None = None
         self._missing_told = ""
@@ -219,6 +220,7 @@ class _Watch:
         late_s = _LATE_S if self._feed.paced else float("inf")
         for image in keeper.advance(self._feed.clock.now_ns, late_s, at_end=at_end):
             self._judge(image)
+        self._behind_s = max(self._behind_s, keeper.behind_s)
 
     def _judge(self, image: PosedImage) -> None:
         if self._motion is None:
@@ -256,10 +258,12 @@ class _Watch:
             snapshot.stamp_ns,
             (self._feed.clock.now_ns() - snapshot.arrival_ns) / 1e9,
             time.monotonic() - running.began,
+            self._behind_s,
             running.counts,
             self._verdict,
             final,
         )
+        self._behind_s = 0.0
         self._on_update(self._update)
         return self._update
 
@@ -324,6 +328,7 @@ def watched_document(update: Update, origin: dict[str, Any] | None) -> dict[str,
         "stamp_ns": update.stamp_ns,
         "delay_s": round(update.delay_s, 3),
         "compute_s": round(update.compute_s, 3),
+        "behind_s": round(update.behind_s, 3),
         **asdict(update.counts),
         "motion": None
         if verdict is None
