@@ -111,6 +111,11 @@ class FrameKeeper:
         return len(self._held)
 
     @property
+    def window(self) -> int:
+        """How many of the last images are kept for those to come."""
+        return len(self._window)
+
+    @property
     def camera(self) -> CameraModel | None:
         """The intrinsics, once poses are known."""
         return self._camera
@@ -127,8 +132,11 @@ class FrameKeeper:
         Raises:
             TooltipError: images of another size than the intrinsics'.
         """
-        images = [image for image in self.follower.passed(at_end=at_end) if self._is_next(image)]
-        for image in images:
+        images = []
+        for image in self.follower.passed(at_end=at_end):
+            if self._count and image.stamp_ns <= self._last_ns:
+                continue
+            images.append(image)
             self._count += 1
             self._last_ns = image.stamp_ns
             self._first_ns = self._first_ns or image.stamp_ns
@@ -161,9 +169,6 @@ class FrameKeeper:
             (stamp_ns - self._first_ns) / 1e9,
             arrival_ns,
         )
-
-    def _is_next(self, image: PosedImage) -> bool:
-        return not self._count or image.stamp_ns > self._last_ns
 
     def _pairing(self) -> CausalPairing:
         if self._causal is None:
