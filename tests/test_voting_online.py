@@ -63,7 +63,7 @@ def kept(points: Array, capacity: int) -> Array:
         if place is not None:
             rows[place] = row
             spread.put(place, point)
-    return points[rows[rows >= 0]]
+    return np.asarray(points[rows[rows >= 0]])
 
 
 @pytest.mark.parametrize("order", ["random", "along"])

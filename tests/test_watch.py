@@ -28,6 +28,7 @@ from tooltip_cli.log.recording import read_recording
 from tooltip_cli.log.stopping import Stop
 from tooltip_cli.log.views import resolve_rig
 from tooltip_cli.method.voting.params import PairingParams, VotingSettings
+from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.stages.calibrate import write_rig
 from tooltip_cli.stages.keeping import FrameKeeper
 from tooltip_cli.stages.watch import Update, WatchOptions, watch_recording
@@ -297,14 +298,19 @@ def test_what_a_live_source_lacks_is_said(
 
 
 def keeper_of(
-    messages: list[Message], settings: VotingSettings | None = None, *, late_by_s: float = 0.0
+    messages: list[Message],
+    settings: VotingSettings | None = None,
+    *,
+    rig: Rig = RIG,
+    late_by_s: float = 0.0,
 ) -> FrameKeeper:
     """Return what keeps the frames of messages that are each looked at so late."""
-    keeper = FrameKeeper(RIG, settings or VotingSettings())
+    keeper = FrameKeeper(rig, settings or VotingSettings())
+    now_ns = 0
     for message in sorted(messages, key=lambda item: item.log_time_ns):
         now_ns = message.log_time_ns + round(late_by_s * 1e9)
         keeper.follower.take(message)
-        keeper.advance(lambda now_ns=now_ns: now_ns, 0.5)
+        keeper.advance(lambda: now_ns, 0.5)
     return keeper
 
 
@@ -357,8 +363,5 @@ def test_images_that_run_backwards_or_come_twice_are_ignored() -> None:
 
 def test_images_of_another_size_than_the_intrinsics_are_an_error() -> None:
     camera = replace(CAMERA, width=2 * CAMERA.width, height=2 * CAMERA.height)
-    keeper = FrameKeeper(replace(RIG, camera=camera), VotingSettings())
     with pytest.raises(TooltipError, match="calibrate at that size"):
-        for message in sorted(messages_of(60), key=lambda item: item.log_time_ns):
-            keeper.follower.take(message)
-            keeper.advance(lambda: 0, 1.0)
+        keeper_of(messages_of(60), rig=replace(RIG, camera=camera))

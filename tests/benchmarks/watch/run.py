@@ -29,9 +29,9 @@ def estimate(recording: Path, rig: list[str], out: Path) -> dict[str, Any]:
     return document
 
 
-def watch(recording: Path, rig: list[str], speed: float) -> tuple[list[dict[str, Any]], float, int]:
+def watch(recording: Path, rig: list[str]) -> tuple[list[dict[str, Any]], float, int]:
     """Return the updates of ``tooltip watch``, processor seconds and bytes of memory."""
-    command = [*_COMMAND, "watch", str(recording), *rig, "--json", "--speed", str(speed)]
+    command = [*_COMMAND, "watch", str(recording), *rig, "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     assert process.stdout is not None
     lines = process.stdout.read().splitlines()
@@ -44,7 +44,7 @@ def spread_mm(document: dict[str, Any]) -> float:
     return 1000 * float(np.sqrt(np.trace(document["tip"]["covariance_m2"])))
 
 
-def main(paths: list[Path], speed: float) -> None:
+def main(paths: list[Path]) -> None:
     folder = Path(tempfile.mkdtemp())
     for path in paths:
         # away from its labels, whose images both leave out, so that all of them are used
@@ -52,7 +52,7 @@ def main(paths: list[Path], speed: float) -> None:
         beside = path.with_name(f"{path.stem}.rig.yaml")
         rig = ["--rig", str(beside)] if beside.exists() else []
         began = time.monotonic()
-        updates, processor_s, memory_kb = watch(recording, rig, speed)
+        updates, processor_s, memory_kb = watch(recording, rig)
         wall_s = time.monotonic() - began
         last = updates[-1]
         delays = [update["delay_s"] for update in updates[:-1]]
@@ -77,7 +77,7 @@ def main(paths: list[Path], speed: float) -> None:
         away = np.subtract(last["tip"]["position_m"], own["tip"]["position_m"])
         squared = float(away @ np.linalg.solve(np.array(last["tip"]["covariance_m2"]), away))
         print(
-            f"  ends {1000 * np.linalg.norm(away):.2f} mm from the estimate of the whole recording: "
+            f"  ends {1000 * np.linalg.norm(away):.2f} mm from the whole recording's estimate: "
             f"{squared**0.5:.2f} standard deviations, "
             f"{'inside' if squared < _REGION else 'OUTSIDE'} the 95 % region"
         )
@@ -85,8 +85,4 @@ def main(paths: list[Path], speed: float) -> None:
 
 
 if __name__ == "__main__":
-    arguments = sys.argv[1:]
-    speed = (
-        float(arguments.pop(0).partition("=")[2]) if arguments[0].startswith("--speed=") else 1.0
-    )
-    main([Path(argument) for argument in arguments], speed)
+    main([Path(argument) for argument in sys.argv[1:]])
