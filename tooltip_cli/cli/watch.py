@@ -354,6 +354,8 @@ def _image_words(update: Update) -> str:
 def _status_words(status: WatchStatus) -> str:
     """Return the line on a terminal: advice first, for the person at the robot looks for it."""
     parts = [] if status.verdict is None else [status.verdict.advice.upper()]
+    if status.ending:
+        parts = ["LAST ESTIMATE"]
     update, counts = status.update, status.counts
     parts.append("no estimate yet" if update is None else _tip_words(update))
     parts += [] if update is None else [_image_words(update)]

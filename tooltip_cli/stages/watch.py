@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import logging
+import queue
 import threading
 import time
 from collections.abc import Callable, Container
@@ -87,41 +88,50 @@ class WatchStatus:
 
     update: Update | None
     counts: Counts
-    behind_s: float  # from the arrival of the last image to its being taken
     verdict: Verdict | None
+    ending: bool  # the last estimate is being made
 
 
 @dataclass
-class _Estimating:
-    """An estimate that is made in a thread."""
+class _Request:
+    """An estimate that is asked for, and what became of it."""
 
     snapshot: Snapshot
     counts: Counts
     began: float = field(default_factory=time.monotonic)
+    done: threading.Event = field(default_factory=threading.Event)
     result: TipEstimate | BaseException | None = None
-    thread: threading.Thread | None = None
-
-    def start(self, rig: Rig, settings: VotingSettings) -> None:
-        def work() -> None:
-            try:
-                self.result = self.snapshot.estimate(rig, settings)
-            except BaseException as error:  # raised again where it is waited for
-                self.result = error
-
-        # a daemon: whoever presses Ctrl-C a second time waits for nothing
-        self.thread = threading.Thread(target=work, daemon=True)
-        self.thread.start()
-
-    def done(self, timeout_s: float | None = 0.0) -> bool:
-        assert self.thread is not None  # noqa: S101 - started
-        self.thread.join(timeout_s)
-        return not self.thread.is_alive()
 
     def estimate(self) -> TipEstimate:
+        """Wait for the estimate, and return or raise what came of it."""
+        self.done.wait()
         if isinstance(self.result, BaseException):
             raise self.result
         assert self.result is not None  # noqa: S101 - it is done
         return self.result
+
+
+class _Estimator:
+    """Makes estimates one after the other, in one thread, whose memory each takes over."""
+
+    def __init__(self, rig: Rig, settings: VotingSettings) -> None:
+        self._rig, self._settings = rig, settings
+        self._requests: queue.SimpleQueue[_Request] = queue.SimpleQueue()
+        # a daemon: whoever presses Ctrl-C a second time waits for nothing
+        threading.Thread(target=self._work, daemon=True).start()
+
+    def ask(self, request: _Request) -> None:
+        """Make an estimate as soon as those before it are made."""
+        self._requests.put(request)
+
+    def _work(self) -> None:
+        while True:
+            request = self._requests.get()
+            try:
+                request.result = request.snapshot.estimate(self._rig, self._settings)
+            except BaseException as error:  # raised again where it is waited for
+                request.result = error
+            request.done.set()
 
 
 def watch(
@@ -178,7 +188,8 @@ class _Watch:
         self._images = 0
         self._first_image: float | None = None
         self._missing_told = ""
-        self._running: _Estimating | None = None
+        self._estimator = _Estimator(rig, settings)
+        self._running: _Request | None = None
         self._seen_changes = 0  # of what is held, that an estimate was begun with
         self._began = -np.inf
         self._update: Update | None = None
@@ -236,20 +247,20 @@ class _Watch:
         """Hand on an estimate that is done, and begin the next where there is anything new."""
         running, now = self._running, time.monotonic()
         if running is not None:
-            if not running.done():
+            if not running.done.is_set():
                 return
             self._finish(running)
         new = self._keeper.changes != self._seen_changes
         if new and now - self._began >= self._options.every_s:
             self._begin()
 
-    def _begin(self) -> _Estimating:
+    def _begin(self) -> _Request:
         self._began, self._seen_changes = time.monotonic(), self._keeper.changes
-        self._running = _Estimating(self._keeper.snapshot(), self._counts())
-        self._running.start(self._rig, self._settings)
+        self._running = _Request(self._keeper.snapshot(), self._counts())
+        self._estimator.ask(self._running)
         return self._running
 
-    def _finish(self, running: _Estimating, *, final: bool = False) -> Update:
+    def _finish(self, running: _Request, *, final: bool = False) -> Update:
         self._running = None
         snapshot = running.snapshot
         self._update = Update(
@@ -278,10 +289,12 @@ class _Watch:
             )
         if self._motion is not None:
             self._verdict = self._motion.judge()
-        if self._running is not None:
-            self._running.done(None)  # older than what is held now, so not told
-        running = self._begin()
-        running.done(None)
+        running = self._running
+        if running is None or keeper.changes != self._seen_changes:
+            running = self._begin()
+        running.counts = self._counts()
+        while not running.done.wait(_STATUS_EVERY_S):
+            self._tell(ending=True)
         return self._finish(running, final=True)
 
     def _over(self) -> str:
@@ -293,7 +306,7 @@ class _Watch:
         enough = options.until_enough and shown and self._keeper.full
         return "the motion is enough" if enough else ""
 
-    def _tell(self) -> None:
+    def _tell(self, *, ending: bool = False) -> None:
         for note in self._feed.news():
             self._on_note(note)
         missing = self._keeper.follower.missing
@@ -301,9 +314,7 @@ class _Watch:
         if since > _SAY_MISSING_S and missing not in ("", self._missing_told):
             self._missing_told = missing
             self._on_note(f"no estimate can be made yet: {missing}")
-        self._on_status(
-            WatchStatus(self._update, self._counts(), self._keeper.behind_s, self._verdict)
-        )
+        self._on_status(WatchStatus(self._update, self._counts(), self._verdict, ending))
 
     def _counts(self) -> Counts:
         keeper = self._keeper
