@@ -44,9 +44,17 @@ class SourceGroup(click.Group):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Put the default's name before arguments that name no source."""
-        if args and args[0] not in (*self.commands, *ctx.help_option_names):
-            args = [_DEFAULT, *args]
-        return super().parse_args(ctx, args)
+        return super().parse_args(ctx, self._with_source(ctx, args))
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command of arguments that may name no source."""
+        return super().resolve_command(ctx, self._with_source(ctx, args))
+
+    def _with_source(self, ctx: click.Context, args: list[str]) -> list[str]:
+        named = not args or args[0] in (*self.commands, *ctx.help_option_names)
+        return args if named else [_DEFAULT, *args]
 
 
 @click.group(cls=SourceGroup, options_metavar="", subcommand_metavar="REC | SOURCE [OPTIONS]")
@@ -156,16 +164,16 @@ def recording(
 ) -> None:
     """Play a recording and estimate the tip meanwhile.
 
-    'tooltip watch REC' is the same. Images with hand labels (STEM.labels.csv) are left out, as
+    The word 'recording' may be left out. Images with hand labels (STEM.labels.csv) are left out, as
     'tooltip estimate' does.
 
     \b
     Examples:
       tooltip watch pliers.mcap
-      tooltip watch pliers.mcap --rig robot.rig.yaml --speed 0 --json
+      tooltip watch recording pliers.mcap --rig robot.rig.yaml --speed 0 --json
     """
     from tooltip_cli.log.recording import Topics
-    from tooltip_cli.stages.watch import watch_recording
+    from tooltip_cli.stages.watched import watch_recording
 
     def run(options: WatchOptions, settings: VotingSettings, **told: Any) -> _Result:
         topics = Topics(image, joints, info, pose)
@@ -262,7 +270,7 @@ _Result = tuple["Update", dict[str, Any]]
 
 def _live(source: LiveSource, reconnect: bool, patience_s: float) -> Callable[..., _Result]:
     """Return what watches a live source."""
-    from tooltip_cli.stages.watch import watch_live
+    from tooltip_cli.stages.watched import watch_live
 
     def run(options: WatchOptions, settings: VotingSettings, **told: Any) -> _Result:
         return watch_live(
@@ -286,7 +294,8 @@ def _run(
     """Watch, say what is found, and exit."""
     from tooltip_cli.log.stopping import stop_on_signals
     from tooltip_cli.method.voting.params import VotingSettings
-    from tooltip_cli.stages.watch import WatchOptions, free_for_tip, watched_document, write_tip
+    from tooltip_cli.stages.watch import WatchOptions
+    from tooltip_cli.stages.watched import free_for_tip, watched_document, write_tip
 
     path = None if out is None else free_for_tip(out, stem, force)
     line = StatusLine(name)
