@@ -4,74 +4,37 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Container
-from dataclasses import dataclass
 
 import numpy as np
 
 from tooltip_cli.errors import TooltipError
-from tooltip_cli.log.images import decode_compressed, decode_raw
-from tooltip_cli.log.messages import IMAGE, decode_foreign
-from tooltip_cli.log.views import Views
-from tooltip_cli.method.rays import sphere_array
-from tooltip_cli.method.types import Array, TipEstimate, refused
-from tooltip_cli.method.voting.estimate import METHOD, check_motion, estimate_by_voting
+from tooltip_cli.log.messages import (
+    COMPRESSED_IMAGE,
+    IMAGE,
+    Message,
+    compressed_image,
+    header_stamp_ns,
+)
 from tooltip_cli.method.voting.moving import (
     FrameEdges,
     Image,
-    join,
     moving_edges,
     noise_level,
     smooth,
 )
 from tooltip_cli.method.voting.online import CausalPairing, Decided, Spread
-from tooltip_cli.method.voting.pairing import Pairing, orientations
+from tooltip_cli.method.voting.pairing import orientations
 from tooltip_cli.method.voting.params import VotingSettings
 from tooltip_cli.rig.camera import CameraModel
-from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.rig.rigfile import Rig
+from tooltip_cli.sources.streams import encode_jpeg
+from tooltip_cli.stages.held import HeldFrame, Snapshot, pixels_of
 from tooltip_cli.stages.moving import hand_in_image
 from tooltip_cli.stages.poses import PosedImage, PoseFollower
-from tooltip_cli.stages.voting import focal_px, hand_edges
+from tooltip_cli.stages.voting import focal_px
 
 _LOG = logging.getLogger(__name__)
 _NOISE_PAIRS = 8
-
-
-@dataclass(frozen=True)
-class _Held:
-    frame: int
-    poses: Array  # (3, 4, 4) camera_from_hand of the image and its partners
-    displacements: tuple[float, float]
-    edges: FrameEdges
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """What an estimate is made from."""
-
-    frames: tuple[_Held, ...]  # in the order of time
-    camera: CameraModel
-    fastest_px: float  # median motion of a tool's end from image to image
-    stamp_ns: int  # of the last image that was taken into account
-    time_s: float  # from the first image to that one
-    arrival_ns: int  # of that one
-
-    def estimate(self, rig: Rig, settings: VotingSettings) -> TipEstimate:
-        """Do what the estimate stage does with the frames that it chooses."""
-        count = len(self.frames)
-        numbers, partners = np.arange(count), count + np.arange(2 * count).reshape(-1, 2)
-        poses = np.concatenate(
-            [np.zeros((0, 4, 4)), *(held.poses[:1] for held in self.frames)]
-            + [held.poses[1:] for held in self.frames]
-        )
-        moved = np.array([held.displacements for held in self.frames]).reshape(-1, 2)
-        reason = check_motion(Pairing(numbers, partners, moved, self.fastest_px), poses, settings)
-        if reason is not None:
-            return refused(METHOD, count, reason)
-        moving = join(numbers, partners, [held.edges for held in self.frames])
-        views = Views(self.camera, numbers, inverse_transform(poses), rig.spheres)
-        spheres = sphere_array([(sphere.center, sphere.radius) for sphere in rig.spheres])
-        return estimate_by_voting(hand_edges(views, moving, poses, settings), spheres, settings)
 
 
 class FrameKeeper:
@@ -87,7 +50,7 @@ class FrameKeeper:
         self._rig, self._settings, self._left_out = rig, settings, left_out
         self.follower = PoseFollower(rig, keep_images=True)
         self._spread = Spread(settings.pairing.frames, 9)
-        self._held: dict[int, _Held] = {}  # by place
+        self._held: dict[int, HeldFrame] = {}  # by place
         self._window: dict[int, PosedImage] = {}
         self._smoothed: dict[int, Image] = {}
         self._noise: list[float] = []
@@ -202,7 +165,15 @@ class FrameKeeper:
             [self._window[i].camera_from_hand for i in (decided.frame, *decided.partners)]
         )
         self._spread.put(place, point)
-        self._held[place] = _Held(decided.frame, poses, decided.displacements, edges)
+        assert image.message is not None  # noqa: S101 - images are kept
+        self._held[place] = HeldFrame(
+            decided.frame,
+            poses,
+            decided.displacements,
+            edges,
+            image.root_from_camera,
+            _packed(image.message, decided.frame),
+        )
         self.changes += 1
 
     def _edges(self, frame: int, partners: tuple[int, int]) -> FrameEdges | None:
@@ -220,13 +191,8 @@ class FrameKeeper:
             pair = self._pixels(frame), self._pixels(partners[1])
             if pair[0] is not None and pair[1] is not None:
                 self._noise.append(noise_level([(pair[0], pair[1])]))
-        views = Views(
-            self._known_camera(),
-            np.zeros(1, dtype=np.int64),
-            inverse_transform(self._window[frame].camera_from_hand[None]),
-            self._rig.spheres,
-        )
-        centres, radii = hand_in_image(views, np.zeros(1, dtype=np.intp), params.reach)
+        pose, camera = self._window[frame].camera_from_hand[None], self._known_camera()
+        centres, radii = hand_in_image(camera, pose, params.reach)
         noise = float(np.median(self._noise))
         return moving_edges(
             images[0], (images[1], images[2]), centres[0], float(radii[0]), noise, params
@@ -240,11 +206,8 @@ class FrameKeeper:
         """Decode an image; None: it is damaged."""
         message = self._window[frame].message
         assert message is not None  # noqa: S101 - images are kept
-        where = f"{message.topic}: image {frame}"
         try:
-            content = decode_foreign(message.datatype, message.payload, where)
-            decode = decode_raw if message.datatype == IMAGE else decode_compressed
-            pixels = decode(content, True, where)
+            pixels = pixels_of(message, frame, gray=True)
         except TooltipError as error:
             _LOG.info("%s", error)
             return None
@@ -256,3 +219,12 @@ class FrameKeeper:
                 "to it"
             )
         return pixels
+
+
+def _packed(message: Message, number: int) -> Message:
+    """Return an image as JPEG where it is raw: hundreds are held."""
+    if message.datatype != IMAGE:
+        return message
+    data = encode_jpeg(pixels_of(message, number, gray=False))
+    payload = compressed_image(header_stamp_ns(message.payload) or 0, "", "jpeg", data)
+    return Message(message.topic, COMPRESSED_IMAGE, message.log_time_ns, payload)

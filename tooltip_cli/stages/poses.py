@@ -30,6 +30,7 @@ class PosedImage:
 
     stamp_ns: int  # of its header
     camera_from_hand: Array  # (4, 4); NaN where it is unknown
+    root_from_camera: Array  # (3, 3) how the camera is turned, as views have it
     message: Message | None  # None: images are not kept
 
 
@@ -116,8 +117,8 @@ class PoseFollower:
         images.sort(key=lambda image: image[0])
         query = np.array([stamp_ns + shift for stamp_ns, _ in images], dtype=np.int64)
         return [
-            PosedImage(stamp_ns, pose, message)
-            for (stamp_ns, message), pose in zip(images, self._camera_from_hand(query), strict=True)
+            PosedImage(stamp_ns, pose, turned, message)
+            for (stamp_ns, message), pose, turned in zip(images, *self._poses(query), strict=True)
         ]
 
     def _take_image(self, message: Message) -> None:
@@ -164,17 +165,19 @@ class PoseFollower:
         if len(self._stamps) > 2 * _SAMPLES:
             del self._stamps[:-_SAMPLES], self._samples[:-_SAMPLES]
 
-    def _camera_from_hand(self, query_ns: Stamps) -> Array:
-        """Return (N, 4, 4) at some ascending times; NaN where it is unknown."""
+    def _poses(self, query_ns: Stamps) -> tuple[Array, Array]:
+        """Return (N, 4, 4) camera_from_hand and (N, 3, 3) root_from_camera at ascending times."""
         first = max(bisect_left(self._stamps, int(query_ns[0])) - 1, 0)
         last = bisect_left(self._stamps, int(query_ns[-1])) + 1
         if first >= len(self._stamps):
-            return np.full((len(query_ns), 4, 4), np.nan)
+            unknown = np.full((len(query_ns), 4, 4), np.nan)
+            return unknown, unknown[:, :3, :3]
         stamps = np.array(self._stamps[first:last], dtype=np.int64)
         samples = np.array(self._samples[first:last])
         if self._chain is not None:
             joints = [interpolate(stamps, track, query_ns, MAX_GAP_NS) for track in samples.T]
-            return inverse_transform(self._chain.hand_from_camera(np.stack(joints, axis=1)))
+            hand, root = self._chain.camera_poses(np.stack(joints, axis=1))
+            return inverse_transform(hand), root[:, :3, :3]
         mount = self._rig.mount
         assert mount is not None  # noqa: S101 - seen to by _prepare
         positions, quaternions = interpolate_poses(
@@ -183,4 +186,5 @@ class PoseFollower:
         base_from_hand = np.tile(np.eye(4), (len(query_ns), 1, 1))
         base_from_hand[:, :3, :3] = rotation_from_quaternion(quaternions)
         base_from_hand[:, :3, 3] = positions
-        return np.asarray(inverse_transform(mount.parent_from_camera) @ base_from_hand)
+        still = np.tile(np.eye(3), (len(query_ns), 1, 1))
+        return np.asarray(inverse_transform(mount.parent_from_camera) @ base_from_hand), still

@@ -23,7 +23,8 @@ from tooltip_cli.method.voting.params import VotingSettings
 from tooltip_cli.method.voting.watching import MotionWatch, Verdict
 from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.stages.feeds import Feed
-from tooltip_cli.stages.keeping import FrameKeeper, Snapshot
+from tooltip_cli.stages.held import HeldEstimator, Snapshot
+from tooltip_cli.stages.keeping import FrameKeeper
 from tooltip_cli.stages.poses import PosedImage
 from tooltip_cli.stages.threads import threads_are_ours
 from tooltip_cli.stages.voting import focal_px
@@ -86,6 +87,7 @@ class _Request:
 
     snapshot: Snapshot
     counts: Counts
+    final: bool
     began: float = field(default_factory=time.monotonic)
     done: threading.Event = field(default_factory=threading.Event)
     result: TipEstimate | BaseException | None = None
@@ -103,7 +105,7 @@ class _Estimator:
     """Makes estimates one after the other, in one thread, whose memory each takes over."""
 
     def __init__(self, rig: Rig, settings: VotingSettings) -> None:
-        self._rig, self._settings = rig, settings
+        self._held = HeldEstimator(rig, settings)
         self._requests: queue.SimpleQueue[_Request] = queue.SimpleQueue()
         # a daemon: whoever presses Ctrl-C a second time waits for nothing
         threading.Thread(target=self._work, daemon=True).start()
@@ -116,7 +118,7 @@ class _Estimator:
         while True:
             request = self._requests.get()
             try:
-                request.result = request.snapshot.estimate(self._rig, self._settings)
+                request.result = self._held.estimate(request.snapshot, final=request.final)
             except BaseException as error:  # raised again where it is waited for
                 request.result = error
             request.done.set()
@@ -242,13 +244,13 @@ class _Watch:
         if new and now - self._began >= self._options.every_s:
             self._begin()
 
-    def _begin(self) -> _Request:
+    def _begin(self, *, final: bool = False) -> _Request:
         self._began, self._seen_changes = time.monotonic(), self._keeper.changes
-        self._running = _Request(self._keeper.snapshot(), self._counts())
+        self._running = _Request(self._keeper.snapshot(), self._counts(), final)
         self._estimator.ask(self._running)
         return self._running
 
-    def _finish(self, running: _Request, *, final: bool = False) -> Update:
+    def _finish(self, running: _Request) -> Update:
         self._running = None
         snapshot = running.snapshot
         self._update = Update(
@@ -260,7 +262,7 @@ class _Watch:
             self._behind_s,
             running.counts,
             self._verdict,
-            final,
+            running.final,
         )
         self._behind_s = 0.0
         self._on_update(self._update)
@@ -277,13 +279,10 @@ class _Watch:
             )
         if self._motion is not None:
             self._verdict = self._motion.judge()
-        running = self._running
-        if running is None or keeper.changes != self._seen_changes:
-            running = self._begin()
-        running.counts = self._counts()
+        running = self._begin(final=True)
         while not running.done.wait(_STATUS_EVERY_S):
             self._tell(ending=True)
-        return self._finish(running, final=True)
+        return self._finish(running)
 
     def _over(self) -> str:
         options, update = self._options, self._update
