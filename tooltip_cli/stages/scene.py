@@ -115,8 +115,6 @@ def turn_map(camera: CameraModel, there_from_here: npt.NDArray[np.float64]) -> M
     Args:
         there_from_here: (3, 3) rotation between the camera's two orientations.
     """
-    import cv2
-
     columns, rows = _GRID
     u, v = np.meshgrid(
         np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
@@ -126,10 +124,14 @@ def turn_map(camera: CameraModel, there_from_here: npt.NDArray[np.float64]) -> M
     if np.nanmax(np.abs(there - here)) < _STILL_PX:
         return None
     coarse = np.nan_to_num(there, nan=_OUTSIDE).astype(np.float32)
-    across = np.linspace(0, columns - 1, camera.width, dtype=np.float32)
-    down = np.linspace(0, rows - 1, camera.height, dtype=np.float32)
-    at = np.stack(np.meshgrid(across, down), axis=-1)
-    return np.asarray(cv2.remap(coarse, at, None, cv2.INTER_LINEAR), dtype=np.float32)
+    down, across = _linear(rows, camera.height), _linear(columns, camera.width)
+    return np.stack([down @ coarse[..., axis] @ across.T for axis in (0, 1)], axis=-1)
+
+
+def _linear(count: int, size: int) -> Map:
+    """Return (size, count) weights of so many evenly spread values at each of so many places."""
+    place = np.linspace(0, count - 1, size, dtype=np.float32)
+    return np.asarray(np.maximum(1 - np.abs(place[:, None] - np.arange(count)), 0), np.float32)
 
 
 def _looked_up(image: Image, turn: Map) -> Image:

@@ -23,9 +23,15 @@ from tooltip_cli.method.voting.end import (
 )
 from tooltip_cli.method.voting.hull import visual_hull
 from tooltip_cli.method.voting.outline import fit_outlines
-from tooltip_cli.method.voting.params import EndParams, TrustParams, VotingSettings
+from tooltip_cli.method.voting.params import (
+    EndParams,
+    RefineParams,
+    TrustParams,
+    VotingSettings,
+)
 from tooltip_cli.method.voting.refine import Fit, RefinedEnd, refine_end, resampled
-from tooltip_cli.method.voting.volume import Cloud, HandEdges
+from tooltip_cli.method.voting.sight import NearEdges, near_edges, near_outlines
+from tooltip_cli.method.voting.volume import Cloud, HandEdges, reconstruct
 
 
 @dataclass(frozen=True)
@@ -68,18 +74,24 @@ def find_ends(
 
 
 def _apart(ends: list[FoundEnd], params: EndParams) -> list[FoundEnd]:
-    """Return ends that differ, the farthest first; of those at one place the best."""
+    """Return ends that differ, the farthest first; of those at one place the best.
+
+    One that far fewer images show, or agree on, than on another is no end that could be meant.
+    """
     kept: list[FoundEnd] = []
     for end in sorted(ends, key=lambda item: -item.agreement):
-        at = end.candidate.position
-        if all(
-            np.linalg.norm(at - other.candidate.position) > 0.5 * params.end_separation
-            for other in kept
-        ):
+        apart = [end.candidate.position - other.candidate.position for other in kept]
+        if all(np.linalg.norm(away) > 0.5 * params.end_separation for away in apart):
             kept.append(end)
-    kept.sort(key=lambda item: -float(np.linalg.norm(item.candidate.position)))
+    share = params.other_end_support
+    agreement = share * max(end.agreement for end in kept)
+    support = share * max(end.candidate.support for end in kept)
+    kept = [
+        end for end in kept if end.agreement >= agreement and end.candidate.support >= support
+    ] or kept[:1]
+    kept.sort(key=lambda end: -float(np.linalg.norm(end.candidate.position)))
     least = params.other_end_share * np.linalg.norm(kept[0].candidate.position)
-    return [item for item in kept if np.linalg.norm(item.candidate.position) >= least]
+    return [end for end in kept if np.linalg.norm(end.candidate.position) >= least]
 
 
 def _rough_ends(
@@ -123,19 +135,65 @@ def _confirmed(hull: Shape, shape: Shape, within: float) -> Shape:
     return Shape(hull.voxels[near], hull.counts[near])
 
 
+@dataclass(frozen=True)
+class ClosePart:
+    """The tool's first end, roughly, with all edges about it."""
+
+    near: NearEdges
+    position: Array  # (3,) metres, hand frame
+    axis: Array  # (3,) unit vector, hand frame
+    radius: float  # metres
+
+
+def first_end(edges: HandEdges, spheres: Array, settings: VotingSettings) -> ClosePart | None:
+    """Return the first end as well as it can be told with wrong clocks or cameras; None: none.
+
+    Args:
+        spheres: (S, 4) centre and radius of hand and wrist, metres.
+    """
+    cloud = reconstruct(edges, settings.voting)
+    shape = tool_shape(cloud, spheres, edges.reach, settings.end)
+    if not len(shape.voxels):
+        return None
+    rough, *others = _rough_ends(edges, cloud, shape, spheres, settings)
+    refine = settings.refine
+    fit = _outline_fit(
+        edges, rough, spheres, settings, replace(refine, loss_px=refine.first_loss_px)
+    )
+    if fit is not None and edges.silhouettes is not None:
+        near = near_outlines(edges.silhouettes, fit.position, refine)
+        return ClosePart(near, fit.position, fit.axis, fit.radius)
+    voted = next((item.voted for item in (rough, *others) if item.voted is not None), None)
+    if voted is None:
+        return None
+    near = near_edges(edges, cloud, voted.position, refine)
+    return ClosePart(near, voted.position, voted.axis, voted.radius)
+
+
+def _outline_fit(
+    edges: HandEdges,
+    rough: _Rough,
+    spheres: Array,
+    settings: VotingSettings,
+    refine: RefineParams,
+) -> Fit | None:
+    """Return what the silhouettes' outlines say of an end; None: there are none, or nothing."""
+    if edges.silhouettes is None:
+        return None
+    starts = [*rough.solid, *([] if rough.voted is None else [rough.voted])]
+    fit = fit_outlines(edges.silhouettes, starts, grip_of(spheres), refine, settings.outline)
+    return None if fit is None or fit.agreement(refine) < refine.min_agreement else fit
+
+
 def _by_outlines(
     edges: HandEdges, rough: _Rough, spheres: Array, settings: VotingSettings
 ) -> FoundEnd | None:
     """Put an end right by the silhouettes' outlines; None: there are none, or too few agree."""
-    if edges.silhouettes is None:
+    fit = _outline_fit(edges, rough, spheres, settings, settings.refine)
+    if fit is None:
         return None
-    starts = [*rough.solid, *([] if rough.voted is None else [rough.voted])]
-    fit = fit_outlines(
-        edges.silhouettes, starts, grip_of(spheres), settings.refine, settings.outline
-    )
-    if fit is None or fit.agreement(settings.refine) < settings.refine.min_agreement:
-        return None
-    return _found(fit, fit.support(settings.refine), settings)
+    refined = resampled(fit, settings.refine, settings.trust.seed)
+    return _refined(refined, fit.support(settings.refine), settings)
 
 
 def _by_edges(
@@ -154,10 +212,6 @@ def _by_edges(
         covariance = _voted_covariance(cloud, end, far, spheres, edges.reach, settings)
         return FoundEnd(Candidate(end.position, end.support, covariance, end.axis), 0.0)
     return _refined(refined, end.support, settings)
-
-
-def _found(fit: Fit, support: float, settings: VotingSettings) -> FoundEnd:
-    return _refined(resampled(fit, settings.refine, settings.trust.seed), support, settings)
 
 
 def _refined(end: RefinedEnd, support: float, settings: VotingSettings) -> FoundEnd:

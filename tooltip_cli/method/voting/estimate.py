@@ -6,7 +6,7 @@ import numpy as np
 
 from tooltip_cli.method.rays import angular_spread
 from tooltip_cli.method.types import Array, Candidate, Reason, TipEstimate, refused
-from tooltip_cli.method.voting.end import ToolEnd, far_voxels, locate_end, tool_shape
+from tooltip_cli.method.voting.end import tool_shape
 from tooltip_cli.method.voting.ends import find_ends
 from tooltip_cli.method.voting.pairing import Pairing
 from tooltip_cli.method.voting.params import TrustParams, VotingSettings
@@ -70,8 +70,6 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     if cloud.consistent < trust.min_consistent and found[0].agreement < trust.convincing_agreement:
         return refused(METHOD, used, _nothing_consistent(cloud))
     candidates = [end.candidate for end in found]
-    least = settings.end.other_end_support * candidates[0].support
-    candidates = [item for item in candidates if item.support >= least]
     if settings.prefer is not None:
         candidates = [preferred(candidates, np.array(settings.prefer))]
     first = candidates[0]
@@ -85,18 +83,6 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
 def preferred(candidates: list[Candidate], direction: Array) -> Candidate:
     """Return the candidate that lies farthest in a direction (3,), hand frame."""
     return max(candidates, key=lambda item: float(item.position @ direction))
-
-
-def first_end(
-    edges: HandEdges, spheres: Array, settings: VotingSettings
-) -> tuple[Cloud, ToolEnd] | None:
-    """Return what was voted and its first end as the voxels give it; None: there is none."""
-    cloud = reconstruct(edges, settings.voting)
-    shape = tool_shape(cloud, spheres, edges.reach, settings.end)
-    ends = far_voxels(shape, settings.end)
-    if not len(ends):
-        return None
-    return cloud, locate_end(cloud, shape, shape.voxels[ends[0]], spheres, settings.end)
 
 
 def _hidden(position: Array, edges: HandEdges, trust: TrustParams) -> Reason | None:

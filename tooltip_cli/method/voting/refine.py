@@ -153,6 +153,7 @@ class Fit:
     position: Array  # (3,) metres, hand frame
     axis: Array  # (3,) unit vector, hand frame
     pixels_per_metre: float
+    radius: float  # metres, the rough one that it began with
     end_width: float  # metres across, that was looked at
     pointed: bool  # whether that is one thing beside others
 
@@ -218,7 +219,9 @@ def fit_end(
         end_width = _next_width(measured.halves[:, 0], end_width, width, pointed, index, params)
         if loss > last_loss:
             continue
-        fit = Fit(system, unknowns, loss, at, axis, pixels, end_width, pointed, len(sight.scale))
+        fit = Fit(
+            system, unknowns, loss, at, axis, pixels, radius, end_width, pointed, len(sight.scale)
+        )
         if np.linalg.norm(at - start) < params.max_move:
             fits.append((fit.support(params), fit))
         if np.linalg.norm(step) < _SETTLED:
