@@ -15,6 +15,7 @@ from tooltip_cli.log.messages import (
     compressed_image,
     header_stamp_ns,
 )
+from tooltip_cli.log.views import Views
 from tooltip_cli.method.voting.moving import (
     FrameEdges,
     Image,
@@ -26,6 +27,7 @@ from tooltip_cli.method.voting.online import CausalPairing, Decided, Spread
 from tooltip_cli.method.voting.pairing import orientations
 from tooltip_cli.method.voting.params import VotingSettings
 from tooltip_cli.rig.camera import CameraModel
+from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.sources.streams import encode_jpeg
 from tooltip_cli.stages.held import HeldFrame, Snapshot, pixels_of
@@ -191,8 +193,15 @@ class FrameKeeper:
             pair = self._pixels(frame), self._pixels(partners[1])
             if pair[0] is not None and pair[1] is not None:
                 self._noise.append(noise_level([(pair[0], pair[1])]))
-        pose, camera = self._window[frame].camera_from_hand[None], self._known_camera()
-        centres, radii = hand_in_image(camera, pose, params.reach)
+        image = self._window[frame]
+        view = Views(
+            self._known_camera(),
+            np.array([image.stamp_ns]),
+            inverse_transform(image.camera_from_hand[None]),
+            self._rig.spheres,
+            image.root_from_camera[None],
+        )
+        centres, radii = hand_in_image(view, np.zeros(1, dtype=np.intp), params.reach)
         noise = float(np.median(self._noise))
         return moving_edges(
             images[0], (images[1], images[2]), centres[0], float(radii[0]), noise, params

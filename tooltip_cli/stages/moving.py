@@ -81,7 +81,7 @@ def detect_edges_in(
         TooltipError: an image cannot be decoded, or the artifact not written.
     """
     params = {"moving": settings.moving, "silhouette": settings.silhouette}
-    centres, radii = _hand_in_images(views, pairing.frames, settings.moving.reach)
+    centres, radii = hand_in_image(views, pairing.frames, settings.moving.reach)
     parents = {
         "recording": recording.sha256,
         "image_topic": recording.image_topic,
@@ -180,7 +180,7 @@ def _chunk(
         lap("decode")
         images[int(index)] = smooth(image, params)
         lap("moving edges")
-    centres, radii = _hand_in_images(views, frames, params.reach)
+    centres, radii = hand_in_image(views, frames, params.reach)
     found = [
         moving_edges(
             images[int(frame)],
@@ -198,19 +198,13 @@ def _chunk(
     return found
 
 
-def hand_in_image(
-    camera: CameraModel, camera_from_hand: Array, reach: float
-) -> tuple[Array, Array]:
+def hand_in_image(views: Views, frames: Indices, reach: float) -> tuple[Array, Array]:
     """Return (F, 2) where the hand's origin projects and (F,) the reach around it, pixels."""
+    camera_from_hand = inverse_transform(views.hand_from_camera[frames])
     origins = camera_from_hand[:, :3, 3]
     ahead = np.maximum(origins[:, 2] - 0.5 * reach, 0.1)
-    radii = max(camera.fx, camera.fy) * reach / ahead
-    return camera.project(origins), radii
-
-
-def _hand_in_images(views: Views, frames: Indices, reach: float) -> tuple[Array, Array]:
-    camera_from_hand = inverse_transform(views.hand_from_camera[frames])
-    return hand_in_image(views.camera, camera_from_hand, reach)
+    radii = max(views.camera.fx, views.camera.fy) * reach / ahead
+    return views.camera.project(origins), radii
 
 
 def image_extent(camera: CameraModel) -> Array:
