@@ -19,11 +19,11 @@ import pytest
 
 from tests.helpers.cli import tooltip
 from tests.helpers.live import MjpegServer, free_port, play, played, udp_joints
-from tests.helpers.logs import image_message, stamp_of, wrist_parts
-from tests.helpers.robot import CAMERA, RIG
+from tests.helpers.logs import FRAME_NS, image_message, logged_image, stamp_of, wrist_parts
+from tests.helpers.robot import CAMERA, CAMERA_FRAME, RIG
 from tests.test_stage_voting import simulate, truth
 from tooltip_cli.errors import TooltipError
-from tooltip_cli.log.messages import COMPRESSED_IMAGE, Message, header_stamp_ns
+from tooltip_cli.log.messages import COMPRESSED_IMAGE, IMAGE, Message, encode, header
 from tooltip_cli.log.recording import Recording, read_recording
 from tooltip_cli.log.stopping import Stop
 from tooltip_cli.log.views import resolve_rig
@@ -362,13 +362,28 @@ def test_a_damaged_image_is_left_out_with_those_that_need_it() -> None:
     messages = messages_of(60)
     whole = keeper_of(messages)
     for i, message in enumerate(messages):
-        if message.datatype == COMPRESSED_IMAGE and header_stamp_ns(message.payload) == stamp_of(
-            30
-        ):
+        if message.datatype == COMPRESSED_IMAGE and message.log_time_ns == stamp_of(30):
             messages[i] = image_message(stamp_of(30), b"\xff\xd8\xff nothing")
     keeper = keeper_of(messages)
     assert 1 <= keeper.unreadable <= 15
     assert keeper.held == whole.held - keeper.unreadable
+
+
+def test_raw_images_are_held_as_jpeg() -> None:
+    messages = messages_of(60)
+    for i, message in enumerate(messages):
+        if message.datatype == COMPRESSED_IMAGE:
+            pixels = logged_image(round((message.log_time_ns - stamp_of(0)) / FRAME_NS))
+            height, width = pixels.shape[:2]
+            fields = {"height": height, "width": width, "encoding": "mono8", "step": width}
+            head = header(message.log_time_ns, CAMERA_FRAME)
+            payload = encode(IMAGE, {"header": head, **fields, "data": pixels.tobytes()})
+            messages[i] = replace(message, datatype=IMAGE, payload=payload)
+    frames = keeper_of(messages).snapshot().frames
+    assert len(frames) > 20
+    assert {held.message.datatype for held in frames} == {COMPRESSED_IMAGE}
+    raw = [len(message.payload) for message in messages if message.datatype == IMAGE]
+    assert max(len(held.message.payload) for held in frames) < 0.7 * min(raw)
 
 
 def test_images_that_run_backwards_or_come_twice_are_ignored() -> None:
