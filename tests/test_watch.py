@@ -97,7 +97,7 @@ def test_the_last_estimate_does_not_depend_on_the_pace(small: Path) -> None:
 
 
 def test_a_line_an_update_and_a_sentence_at_the_end(small: Path, tmp_path: Path) -> None:
-    done = tooltip("watch", "--speed", 4, "--every", 0.2, small, "--out", tmp_path)
+    done = tooltip("watch", "--speed", 0, "--every", 0.1, small, "--out", tmp_path)
     assert done.code == 0, done.err
     assert done.out.startswith("small: tip at x ")
     lines = [line for line in done.err.splitlines() if "images" in line]

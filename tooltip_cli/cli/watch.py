@@ -32,7 +32,7 @@ from tooltip_cli.cli.record_live import (
 if TYPE_CHECKING:
     from tooltip_cli.method.voting.params import VotingSettings
     from tooltip_cli.sources.live import LiveSource
-    from tooltip_cli.stages.watch import Update, WatchOptions, WatchStatus
+    from tooltip_cli.stages.watch import Counts, Update, WatchOptions, WatchStatus
 
 _Command = TypeVar("_Command", bound=Callable[..., object])
 Prefer = tuple[float, float, float]
@@ -337,7 +337,7 @@ def _run(
 
 def _update_words(update: Update) -> str:
     """Return an update on one line."""
-    parts = [_tip_words(update), _image_words(update)]
+    parts = [_tip_words(update), _image_words(update), *_lost_words(update.counts)]
     if update.verdict is not None:
         parts.append(update.verdict.advice)
     return f"{update.time_s:.1f} s: " + "; ".join(parts)
@@ -368,11 +368,15 @@ def _status_words(status: WatchStatus) -> str:
     update, counts = status.update, status.counts
     parts.append("no estimate yet" if update is None else _tip_words(update))
     parts += [] if update is None else [_image_words(update)]
-    parts.append(f"{counts.images} seen")
-    for count, what in (
+    parts += [f"{counts.images} seen", *_lost_words(counts)]
+    return " | ".join(parts)
+
+
+def _lost_words(counts: Counts) -> list[str]:
+    """Return how many images could not be used, where there are any."""
+    lost = (
         (counts.passed_over, "passed over"),
         (counts.unreadable, "unreadable"),
         (counts.dropped, "dropped"),
-    ):
-        parts += [f"{count} {what}"] if count else []
-    return " | ".join(parts)
+    )
+    return [f"{count} {what}" for count, what in lost if count]
