@@ -27,6 +27,7 @@ from tooltip_cli.report.tables import number
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+_VALUE_SHARE = 0.13  # of the axis, that a value behind a bar takes
 _MOST_BARS = 40  # more tools than this are not told apart in one chart
 
 
@@ -40,7 +41,7 @@ def error_by_tool(report: EvaluationReport) -> Drawing | None:
     chart, axes = _bar_chart(rows)
     for offset, color, label, errors in (
         (0.2, DETECTOR, "from detections", [row.detector_px for row in rows]),
-        (-0.2, BASELINE, "from labels (baseline)", [row.baseline_px for row in rows]),
+        (-0.2, BASELINE, "from labels", [row.baseline_px for row in rows]),
     ):
         places = np.arange(len(rows)) + offset
         means = [np.nan if error is None else error.mean for error in errors]
@@ -58,11 +59,11 @@ def error_by_tool(report: EvaluationReport) -> Drawing | None:
             markersize=3.5,
             markerfacecolor=PAPER,
             linestyle="none",
-            label="nearest of several ends",
+            label="nearest end",
         )
-    axes.set_xlabel("mean prediction error [px]; whiskers: 95 % interval")
+    axes.set_xlabel("mean error [px], 95 % interval")
     axes.set_xlim(0, 1.22 * max(_reach(row) for row in rows))
-    chart.legend_above(2)
+    chart.legend_above(3)
     simulated = " Labels are simulated." if any(_simulated(row) for row in rows) else ""
     return chart.drawing(
         "error-by-tool",
@@ -103,21 +104,22 @@ def tip_error_by_tool(report: EvaluationReport) -> Drawing | None:
     rows = _shown(scored)
     columns = (
         (0.2, DETECTOR, "from detections", [row.tip_error_mm for row in rows]),
-        (-0.2, BASELINE, "from labels (baseline)", [row.baseline_tip_error_mm for row in rows]),
+        (-0.2, BASELINE, "from labels", [row.baseline_tip_error_mm for row in rows]),
     )
     known = [value for *_, values in columns for value in values if value is not None]
     if not known:
         return None
     radii = [_region(row) for row in rows]
+    limit = 1.18 * max(*known, *map(float, np.nan_to_num(radii)))
     chart, axes = _bar_chart(rows)
     for offset, color, label, values in columns:
         places = np.arange(len(rows)) + offset
         lengths = [np.nan if value is None else value for value in values]
         axes.barh(places, lengths, 0.36, color=color, label=label)
-        behind = radii if color == DETECTOR else [0.0] * len(rows)  # the value is past the stroke
-        for place, value, radius in zip(places, values, behind, strict=True):
+        for place, value, radius in zip(places, values, radii, strict=True):
             if value is not None:
-                _value(axes, max(value, float(np.nan_to_num(radius))), place, value)
+                hidden = color == DETECTOR and 0 <= radius - value < _VALUE_SHARE * limit
+                _value(axes, radius if hidden else value, place, value)
     axes.plot(
         radii,
         np.arange(len(rows)) + 0.2,
@@ -125,12 +127,12 @@ def tip_error_by_tool(report: EvaluationReport) -> Drawing | None:
         marker="|",
         markersize=9,
         linestyle="none",
-        label="stated: 95 % below",
+        label="stated 95 %",
     )
     _refused(axes, rows, [row.tip_error_mm for row in rows])
     axes.set_xlabel("distance to the true tip [mm]")
-    axes.set_xlim(0, 1.18 * max(*known, *np.nan_to_num(radii)))
-    chart.legend_above(2)
+    axes.set_xlim(0, limit)
+    chart.legend_above(3)
     return chart.drawing(
         "tip-error-by-tool",
         "Distance to the true tip",
@@ -167,9 +169,9 @@ def shares_by_tool(report: EvaluationReport) -> Drawing | None:
     chart, axes = _bar_chart(rows)
     places, start = np.arange(len(rows)), np.zeros(len(rows))
     for color, label, values in (
-        (BASELINE, "calibration, labels", [item.calibration_px for item in shares]),
-        (CLOCK, "clocks", [item.clock_px for item in shares]),
         (DETECTION, "detection", [max(item.detection_px, 0.0) for item in shares]),
+        (CLOCK, "synchronisation", [item.clock_px for item in shares]),
+        (BASELINE, "the rest", [item.calibration_px for item in shares]),
     ):
         axes.barh(places, values, 0.6, left=start, color=color, label=label)
         start = start + np.array(values)
@@ -183,14 +185,15 @@ def shares_by_tool(report: EvaluationReport) -> Drawing | None:
         "Where the error comes from",
         "Stacked bars of what the mean prediction error is made of, in pixels. "
         + "; ".join(
-            f"{row.name}: {item.detection_px:.1f} detection, {item.clock_px:.1f} clocks, "
+            f"{row.name}: {item.detection_px:.1f} detection, "
+            f"{item.clock_px:.1f} synchronisation, "
             f"{item.calibration_px:.1f} calibration and labels"
             for row, item in zip(reversed(rows), reversed(shares), strict=True)
         )
         + ".",
-        "Detection: what goes when labels take the place of detections. Clocks: what goes when the "
-        "stamps are shifted. The rest is calibration and the labels' own noise. The number is the "
-        "whole error; where the bar is longer, detections did better than labels."
+        "Detection: what goes when labels take the place of detections. Synchronisation: what goes "
+        "when the stamps are shifted. The rest is calibration and the labels' own noise. The "
+        "number is the whole error; where the bar is longer, detections did better than labels."
         + _left_out(scored, rows),
         ("tool", "total_px", "detection_px", "clock_px", "calibration_px"),
         [
@@ -237,7 +240,7 @@ def _bar_chart(rows: Sequence[RecordingReport]) -> tuple[Chart, Axes]:
     """Return a chart with a line for each tool, and its axes."""
     longest = max(len(shortened(row.name)) for row in rows)
     left = min(1.6, 0.2 + 0.065 * longest)
-    chart = Chart(0.95 + 0.36 * len(rows), left=left, top=0.46, bottom=0.42)
+    chart = Chart(0.77 + 0.36 * len(rows), left=left, top=0.28, bottom=0.42)
     axes: Axes = chart.axes()
     axes.set_ylim(-0.5, len(rows) - 0.5)
     axes.set_yticks(np.arange(len(rows)), [shortened(row.name) for row in rows])

@@ -100,18 +100,17 @@ def _prediction(
     shapes: list[Shape] = []
     (u, v), (x, y) = table.prediction[place], table.label[place]
     if np.isfinite(u):
-        shapes += overlay.cross(u, v, CROSS_PX, overlay.WHITE, 1.5 * scale, gap=_GAP_PX)
+        shapes += overlay.cross(u, v, CROSS_PX, overlay.WHITE, scale, gap=_GAP_PX)
         if mean is not None:
-            shapes.append(Circle(u, v, mean, overlay.WHITE, scale))
+            shapes.append(Circle(u, v, mean, overlay.WHITE, 0.8 * scale))
     if np.isfinite(x):
         shapes.append(Circle(x, y, 1.3 * scale, overlay.WHITE, filled=True))
-    hand = project_tip(scene.views, np.zeros(3), table.frames[place : place + 1])[0]
     reach = CROSS_PX / 2 if mean is None else max(CROSS_PX / 2, mean)
-    spots = (table.prediction[place] - reach, table.prediction[place] + reach, (x, y), hand)
-    corners = np.array([spot for spot in spots if np.isfinite(spot).all()])
+    spots = np.array([(u - reach, v - reach), (u + reach, v + reach), (x, y)])
+    corners = np.clip(spots[np.isfinite(spots).all(axis=1)], low, high)
     window = overlay.whole(image)
     if len(corners):
-        window = overlay.window_around(np.clip(corners, low, high), image, image.shape[1] // 2)
+        window = overlay.window_around(corners, image, image.shape[1] // 4)
     words = f"Frame {table.frames[place]}"
     key = [f"Cross ({CROSS_PX} px across): the prediction."] if np.isfinite(u) else []
     if not np.isfinite(u):
@@ -128,7 +127,7 @@ def _prediction(
     return overlay.drawing(
         f"{row.name}-prediction",
         "Example prediction",
-        f"Camera image of {row.name}. {words}.",
+        f"Part of a camera image of {row.name} around the tip. {words}.",
         " ".join([f"{words}.", *key, "(Figure 5 of the paper.)"]),
         image,
         window,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
+from tooltip_cli.log.views import STORED_RIG
 from tooltip_cli.method.evaluation import ErrorSummary
 from tooltip_cli.report.model import (
     CandidateScore,
@@ -139,7 +139,7 @@ def position_words(score: EstimateScore) -> str:
     for axis, value, deviation in zip("xyz", score.position_m, deviations, strict=True):
         spread = "" if deviation is None else f" ± {deviation:.1f}"
         parts.append(f"{axis} {1000 * value:.1f}{spread}")
-    return ", ".join(parts) + " mm"
+    return ", ".join(parts) + "\u00a0mm"
 
 
 def region_words(score: EstimateScore) -> str:
@@ -177,8 +177,8 @@ def end_words(end: CandidateScore) -> str:
 
 def prefer_command(row: RecordingReport, end: CandidateScore) -> str:
     """Return the command line that takes this one of several ends."""
-    rig = Path(str(row.provenance["rig"]["source"]))
-    given = f" --rig {shlex.quote(str(rig))}" if rig.suffix in (".yaml", ".yml") else ""
+    rig = str(row.provenance["rig"]["source"])
+    given = "" if rig.endswith(STORED_RIG) else f" --rig {shlex.quote(rig)}"
     direction = ",".join(f"{value:.3f}" for value in end.position_m)
     return f"tooltip estimate {shlex.quote(row.recording)}{given} --prefer={direction}"
 
