@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -24,7 +23,6 @@ from tests.helpers.logs import (
     write_true_labels,
 )
 from tests.helpers.robot import TIP, tip_in_camera
-from tooltip_cli.cli.compare import compare as compare_command
 from tooltip_cli.labels.files import TipLabels, match_labels, read_labels, write_labels
 from tooltip_cli.log.recording import read_recording
 from tooltip_cli.log.views import resolve_rig, resolve_views
@@ -594,11 +592,11 @@ def test_compare_names_what_is_wrong(shelf: Path, tmp_path: Path) -> None:
 
 def test_the_compare_command_prints_the_same_as_its_json(shelf: Path, tmp_path: Path) -> None:
     pair = [str(shelf / "report"), str(variant(shelf / "report", tmp_path / "half", 0.5))]
-    shown = CliRunner().invoke(compare_command, pair)
-    document = json.loads(CliRunner().invoke(compare_command, [*pair, "--json"]).stdout)
-    assert shown.exit_code == 0
+    shown = tooltip("compare", *pair)
+    document = json.loads(tooltip("compare", *pair, "--json").out)
+    assert shown.code == 0
     tool = document[0]["tools"][0]
-    line = next(line for line in shown.stdout.splitlines() if line.startswith("wrist"))
+    line = next(line for line in shown.out.splitlines() if line.startswith("wrist"))
     assert line.endswith(BETTER)
     assert f"{tool['change_px']:+.2f} [{tool['low_px']:+.2f}, {tool['high_px']:+.2f}]" in line
 

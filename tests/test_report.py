@@ -17,13 +17,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
-from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.helpers.cli import tooltip
 from tests.helpers.logs import wrist_parts, write_log, write_true_labels
 from tests.helpers.robot import TIP
-from tooltip_cli.cli.main import main as tooltip_command
 from tooltip_cli.errors import MissingExtraError, TooltipError
 from tooltip_cli.labels.files import TipLabels, read_labels, write_labels
 from tooltip_cli.method.estimators import EstimatorParams
@@ -743,9 +742,9 @@ def test_an_end_is_chosen_by_click_and_by_key(browser: Any, two_ends: Path) -> N
     view.close()
     program, *arguments = shlex.split(command)
     assert program == "tooltip"
-    done = CliRunner().invoke(tooltip_command, [*arguments, "--json"])
-    assert done.exit_code in (0, 3), done.output
-    used = json.loads(done.stdout)["provenance"]["parameters"]["settings"]["prefer"]
+    done = tooltip(*arguments, "--json")
+    assert done.code in (0, 3), done.err
+    used = json.loads(done.out)["provenance"]["parameters"]["settings"]["prefer"]
     assert used == [0.03, -0.05, -0.12]
 
 

@@ -21,6 +21,7 @@ from tooltip_cli.report.model import (
 )
 
 PERFECT_PX = 0.5  # nobody labels better than this
+_COUNTED = 20  # times the baseline's error, above which their number says little
 AS_GOOD, CLOSE = 1.25, 2.0  # times the baseline's error
 
 
@@ -47,7 +48,8 @@ def verdict(row: RecordingReport) -> Verdict:
     times = detector / baseline if baseline > 0 else float("inf")
     text = (
         f"The tip estimated from detections projects {detector:.1f} px from the labels on "
-        f"average, {times:.1f} times the baseline's {baseline:.1f} px."
+        f"average, {times:.{1 if times < _COUNTED else 0}f} times the baseline's "
+        f"{baseline:.1f} px."
     )
     # an estimate with status ok may carry reservations
     text = " ".join([text, *(sentence(reason.text) for reason in row.reasons)])
@@ -58,7 +60,8 @@ def verdict(row: RecordingReport) -> Verdict:
         return Verdict("good", "as good as labels", text)
     if times <= CLOSE:
         return Verdict("fair", f"near: {times:.1f} × labels", text)
-    return Verdict("poor", f"off: {times:.1f} × labels", text)
+    short = f"off: {times:.1f} × labels" if times < _COUNTED else f"off by {detector:.0f} px"
+    return Verdict("poor", short, text)
 
 
 def sentence(text: str) -> str:
@@ -332,8 +335,8 @@ def caveats(report: EvaluationReport) -> Iterator[str]:
         )
     yield (
         "Brackets hold 95 % intervals of the mean from 2000 bootstrap draws of blocks of "
-        "neighbouring frames. Intervals of means over tools are for these tools; other tools would "
-        "differ more."
+        "neighbouring frames, widened as Student's t asks for that many blocks. Intervals of means "
+        "over tools are for these tools; other tools would differ more."
     )
     yield (
         f"'As good as labels' means at most {AS_GOOD:g} times the baseline's error, 'near' at most "

@@ -52,7 +52,7 @@ from tooltip_cli.stages.held_out import LABELS_SUFFIX
 from tooltip_cli.stages.measure import Case, Labelled, Protocol, measure
 from tooltip_cli.stages.shape import Voters, voted_shape
 
-VERSION = 3
+VERSION = 4
 DEFAULT_DIRECTORY = "report"
 _LOGGER = logging.getLogger(__name__)
 

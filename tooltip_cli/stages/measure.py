@@ -14,7 +14,7 @@ from tooltip_cli.labels.files import MatchedLabels
 from tooltip_cli.log.recording import Recording
 from tooltip_cli.log.views import Views, resolve_views
 from tooltip_cli.method.detector import DetectorParams
-from tooltip_cli.method.estimators import EstimatorParams
+from tooltip_cli.method.estimators import EstimatorParams, estimate_tip
 from tooltip_cli.method.evaluation import Split, fit_clock, pixel_errors
 from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.report.model import (
@@ -37,7 +37,7 @@ from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.stages.artifacts import digest, plain, provenance
 from tooltip_cli.stages.curve import training_curve
 from tooltip_cli.stages.detect import Detected
-from tooltip_cli.stages.estimate import Estimated
+from tooltip_cli.stages.estimate import Estimated, estimation_input
 from tooltip_cli.stages.shape import Voters
 
 
@@ -202,6 +202,20 @@ def _clock_projection(case: Case, frames: Indices) -> Callable[[Array, float], A
     return project
 
 
+def _clock_px(case: Case, table: FrameTable, offset_s: float, residual_px: float) -> float:
+    """Return what of the baseline's error goes when it is estimated anew with shifted stamps."""
+    if case.labelled is None:
+        return 0.0
+    rig = replace(case.rig, time_offset_s=case.rig.time_offset_s + offset_s)
+    views = resolve_views(case.recording, rig)
+    seen = estimation_input(views, case.labelled.labels.visible)
+    tip = estimate_tip(seen, case.protocol.params).position
+    if tip is None:
+        return 0.0
+    errors = pixel_errors(project_tip(views, tip, table.frames), table.label)
+    return float(np.clip(residual_px - np.nanmean(errors), 0.0, residual_px))
+
+
 def _shares(case: Case, table: FrameTable) -> ErrorShares | None:
     """Attribute the mean error to detection, to the clocks, and to calibration and labels."""
     labels = case.found.get("labels")
@@ -213,7 +227,7 @@ def _shares(case: Case, table: FrameTable) -> ErrorShares | None:
     fit = fit_clock(project, table.label[scored], labels.estimate.position)
     total, residual = float(np.nanmean(prediction)), float(np.nanmean(baseline))
     shown = fit is not None and fit.shown
-    clock = min(fit.error_without_px - fit.error_px, residual) if fit and shown else 0.0
+    clock = _clock_px(case, table, fit.offset_s, residual) if fit and shown else 0.0
     noise = pixel_errors(table.truth, table.label)
     return ErrorShares(
         total_px=total,
