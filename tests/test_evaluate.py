@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -252,6 +253,47 @@ def test_every_method_is_evaluated_alike(tmp_path: Path, method: str) -> None:
     assert sizes[0] == {"voting": 30, "map": 10}[method]
     assert sizes[-1] <= 150  # no labelled frame, and no more than was asked for
     assert row.training[-1].error_px == pytest.approx(row.detector_px.mean)
+
+
+def test_what_voting_saw_is_kept_and_new_labels_cost_no_estimate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = 120
+    path = write_log(tmp_path / "wrist.mcap", wrist_parts(frames))
+    write_true_labels(tmp_path / "wrist.labels.csv", range(2, frames, 8))
+    first = evaluate([path], out=tmp_path / "r").recordings[0]
+    assert first.detector is not None
+    assert first.detector.position_m is not None
+    assert [point.frames for point in first.training][:1] == [50]
+    seen = json.loads((tmp_path / "r" / "tips" / "shape" / "wrist.shape.json").read_text())
+    # hand and tool are a stick from the wrist to the tip
+    along = np.array(seen["points"]) @ TIP / np.linalg.norm(TIP)
+    away = np.linalg.norm(
+        np.array(seen["points"]) - along[:, None] * TIP / np.linalg.norm(TIP), axis=1
+    )
+    assert np.median(away) < 0.01
+    assert along.max() == pytest.approx(np.linalg.norm(TIP), abs=0.02)
+
+    def never(*_: object) -> None:
+        raise AssertionError("estimated again")
+
+    rows = read_labels(tmp_path / "wrist.labels.csv")
+    moved = TipLabels(rows.stamps_ns, rows.pixels + 1.0, rows.states, rows.labelers)
+    write_labels(tmp_path / "wrist.labels.csv", moved)
+    with monkeypatch.context() as patch:
+        patch.setattr("tooltip_cli.stages.curve.estimate_by_voting", never)
+        patch.setattr("tooltip_cli.stages.shape.reconstruct", never)
+        again = evaluate([path], out=tmp_path / "r").recordings[0]
+    assert [point.shift_mm for point in again.training] == [
+        point.shift_mm for point in first.training
+    ]
+    assert again.training[0].error_px != first.training[0].error_px
+    for place in (tmp_path / "r" / "tips").glob("*/wrist.*.json"):
+        if place.parent.name in ("curve", "shape"):
+            place.write_text(place.read_text()[:-20])  # damaged: made anew
+    shutil.rmtree(tmp_path / "r" / "parts")
+    once_more = evaluate([path], out=tmp_path / "r").recordings[0]
+    assert once_more.training == again.training
 
 
 # What depends on what.

@@ -86,6 +86,7 @@ def _over_time(row: RecordingReport, table: FrameTable) -> Drawing:
             transform=axes.get_xaxis_transform(),
         )
     axes.set_yscale("log")
+    axes.minorticks_off()
     axes.set_xlabel("time since the first test frame [s]")
     axes.set_ylabel("error [px]" if labelled else "distance [px]")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
