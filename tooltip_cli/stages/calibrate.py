@@ -84,7 +84,7 @@ def calibrate(
         end = None
         if reason is None:
             detected = detect_edges_in(
-                recording, views, pairing, settings.moving, out=out, jobs=jobs, on_frame=on_frame
+                recording, views, pairing, settings, out=out, jobs=jobs, on_frame=on_frame
             )
             spheres = sphere_array([(sphere.center, sphere.radius) for sphere in views.spheres])
             edges = hand_edges(views, detected.edges, poses, settings)

@@ -21,7 +21,6 @@ from tooltip_cli.report.model import FrameTable, TrainingPoint
 from tooltip_cli.report.scoring import project_tip
 from tooltip_cli.stages.artifacts import artifact_path, plain, read_json, stage_key, write_whole
 from tooltip_cli.stages.estimate import estimation_input
-from tooltip_cli.stages.shape import of_frames
 from tooltip_cli.stages.voting import hand_edges
 
 if TYPE_CHECKING:
@@ -128,7 +127,7 @@ def _votes(case: Case) -> tuple[Indices, EstimateOn]:
     spheres = sphere_array([(item.center, item.radius) for item in views.spheres])
 
     def estimate_on(frames: Indices) -> Array | None:
-        chosen = hand_edges(views, of_frames(edges, frames), camera_from_hand, settings)
+        chosen = hand_edges(views, edges.of_frames(frames), camera_from_hand, settings)
         return estimate_by_voting(chosen, spheres, settings).position
 
     return edges.frames, estimate_on

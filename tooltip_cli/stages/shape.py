@@ -11,7 +11,7 @@ import numpy as np
 
 from tooltip_cli.log.recording import Recording
 from tooltip_cli.log.views import Views
-from tooltip_cli.method.types import Array, Indices, Mask
+from tooltip_cli.method.types import Array, Mask
 from tooltip_cli.method.voting.estimate import METHOD as VOTING
 from tooltip_cli.method.voting.estimate import check_motion
 from tooltip_cli.method.voting.moving import MovingEdges
@@ -52,24 +52,9 @@ class Voters:
         if check_motion(pairing, camera_from_hand, self.settings) is not None:
             return None
         detected = detect_edges_in(
-            self.recording, self.views, pairing, self.settings.moving, out=self.detected_out
+            self.recording, self.views, pairing, self.settings, out=self.detected_out
         )
         return detected.edges, camera_from_hand
-
-
-def of_frames(edges: MovingEdges, frames: Indices) -> MovingEdges:
-    """Return the edges of some of the frames."""
-    kept = np.isin(edges.frames, frames)
-    edge = kept[edges.frame_of_edge]
-    return MovingEdges(
-        edges.frames[kept],
-        edges.partners[kept],
-        edges.affines[kept],
-        edges.counts[kept],
-        edges.pixels[edge],
-        edges.translations[edge],
-        edges.covariances[edge],
-    )
 
 
 def voted_shape(voters: Voters, estimated: Estimated, out: Path) -> VotedShape | None:
@@ -92,7 +77,7 @@ def voted_shape(voters: Voters, estimated: Estimated, out: Path) -> VotedShape |
         return None
     edges, camera_from_hand = voted
     frames = edges.frames[:: max(1, len(edges.frames) // _FRAMES)]
-    some = hand_edges(voters.views, of_frames(edges, frames), camera_from_hand, voters.settings)
+    some = hand_edges(voters.views, edges.of_frames(frames), camera_from_hand, voters.settings)
     cloud = reconstruct(some, voters.settings.voting)
     least = max(2, round(_LEAST * len(frames)))
     points, seen = agreed_points(cloud.points, cloud.frames, _VOXEL, least)
