@@ -132,17 +132,14 @@ def _facts(row: RecordingReport) -> Iterable[tuple[str, str]]:
 
 
 def _candidates(row: RecordingReport, detector: EstimateScore) -> Iterable[tuple[str, str]]:
-    first, *others = detector.candidates
     if detector.ambiguous:
-        yield "End 1, the estimate", words.end_words(first)
-        for which, other in enumerate(others, start=2):
-            command = words.prefer_command(row, other)
-            yield f"End {which}", f"{words.end_words(other)}. To take it: {command}"
-    elif others:
-        yield (
-            "Candidates",
-            f"support {first.support:.0%}; the next best has {others[0].support:.0%}",
-        )
+        for which, end in enumerate(detector.candidates, start=1):
+            command = words.prefer_command(row, end)
+            yield f"End {which}", f"{words.end_words(end)}. To take it: {command}"
+    elif len(detector.candidates) > 1:
+        first, second = detector.candidates[:2]
+        text = f"support {first.support:.0%}; the next best has {second.support:.0%}"
+        yield "Candidates", text
 
 
 def _shares(shares: ErrorShares, nearest_px: float | None) -> str:

@@ -16,7 +16,6 @@ from tooltip_cli.report.model import (
     EstimateScore,
     EvaluationReport,
     RecordingReport,
-    Vector,
     mean_of,
 )
 
@@ -163,14 +162,10 @@ def region_words(score: EstimateScore) -> str:
     return f"{text}; the true tip lies outside, so the stated uncertainty is too small"
 
 
-def place_words(position_m: Vector) -> str:
-    """Return a place in millimetres."""
-    return "(" + ", ".join(f"{1000 * value:.1f}" for value in position_m) + ") mm"
-
-
 def end_words(end: CandidateScore) -> str:
     """Say of one of several ends where it is and how good."""
-    text = f"{place_words(end.position_m)}, support {end.support:.0%}"
+    place = ", ".join(f"{1000 * value:.1f}" for value in end.position_m)
+    text = f"({place}) mm, support {end.support:.0%}"
     if end.error_px is not None:
         text += f", {end.error_px:.1f} px from the labels"
     if end.tip_error_mm is not None:

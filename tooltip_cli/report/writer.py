@@ -29,7 +29,7 @@ from tooltip_cli.report.turnable import rays_figure
 from tooltip_cli.report.worst import worst_figures
 
 VERSION = 4  # of what a section looks like; a change draws all sections anew
-MOST_SECTIONS = 20  # recordings shown in full: hundreds would make a page that opens for nobody
+MOST_SECTIONS = 16  # recordings shown in full: hundreds would make a page that opens for nobody
 MOST_PICTURES = 400  # in the audit tables of the whole page, which keeps it below 10 MB
 _A_RECORDING = (12, 100)  # least and most pictures of one recording
 Save = Callable[[str, str | bytes], None]
