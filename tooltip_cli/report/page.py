@@ -7,12 +7,14 @@ from collections.abc import Iterable, Sequence
 from importlib import resources
 from typing import Any
 
+from tooltip_cli.log.views import STORED_RIG
 from tooltip_cli.method.evaluation import ErrorSummary
 from tooltip_cli.report import words
 from tooltip_cli.report.charts import Drawing, escape
 from tooltip_cli.report.model import EvaluationReport, RecordingReport, mean_of
 from tooltip_cli.report.section import anchor, figure_html, grid
 
+_NAMED = 4  # tools in the title
 _POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     "base-uri 'none'; form-action 'none'"
@@ -33,7 +35,8 @@ def page(
         left_out: names of the others.
     """
     names = [row.name for row in report.recordings]
-    title = "Tool tips: " + ", ".join(names[:4]) + (" ..." if len(names) > 4 else "")
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    title = "Tool tips: " + ", ".join(names[:_NAMED]) + more
     yield f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -182,15 +185,16 @@ def _provenance(report: EvaluationReport) -> str:
             continue
         keys = [score.key[:12] for score in (row.detector, row.baseline) if score is not None]
         labels = "-" if row.labels is None else f"{row.labels.file} {row.labels.digest[:12]}"
-        rig = origin["rig"]
+        rig, made = origin["rig"], str(origin["created"])[:16].replace("T", " ")
+        source = "in the recording" if rig["source"].endswith(STORED_RIG) else rig["source"]
         values = (
             row.recording,
             f"{row.sha256[:12]}...",
             labels,
-            f"{rig['source']} (offset {1000 * rig['time_offset_s']:g} ms)",
+            f"{source}, offset {1000 * rig['time_offset_s']:g} ms",
             f"{origin['detections_key'][:12]}...",
             " ".join(keys),
-            f"{origin['version']}, {origin['created']}",
+            f"{origin['version']}, {made}",
         )
         rows.append([escape(row.name), *(f"<code>{escape(value)}</code>" for value in values)])
     options = "".join(
