@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import shutil
 from pathlib import Path
 from typing import Any
 
 from tests.helpers.logs import write_true_labels
+from tooltip_cli.log.container import LoggedMessage, iterate
 
 TIMED = ("created", "seconds", "seconds_estimate", "seconds_evaluate")
 METHOD = ("--method", "kmeans")
@@ -40,6 +42,26 @@ def artifacts(out: Path) -> dict[str, Any]:
         str(path.relative_to(out)): _timeless(json.loads(path.read_text()))
         for path in sorted((out / "recordings").rglob("*.json"))
     }
+
+
+def contents(out: Path, without: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Return everything under a folder of results, without what depends on the clock.
+
+    Logs are their messages; ``without`` names further keys of JSON files to leave out.
+    """
+    found: dict[str, Any] = {}
+    for path in sorted(path for path in (out / "recordings").rglob("*") if path.is_file()):
+        name = str(path.relative_to(out))
+        if path.suffix == ".json":
+            document = _timeless(json.loads(path.read_text()))
+            found[name] = {key: item for key, item in document.items() if key not in without}
+        elif path.suffix == ".mcap":
+            messages = [item for item in iterate(path) if isinstance(item, LoggedMessage)]
+            sha = hashlib.sha256(b"".join(item.payload for item in messages))
+            found[name] = f"{len(messages)} messages, {sha.hexdigest()}"
+        else:
+            found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
 
 
 def _timeless(value: Any) -> Any:

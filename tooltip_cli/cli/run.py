@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -19,15 +18,14 @@ from tooltip_cli.cli.options import (
     METHODS,
     force_option,
     json_option,
-    out_option,
     print_json,
-    rig_option,
     say,
     topic_options,
 )
 
 if TYPE_CHECKING:
     from tooltip_cli.stages.shelf.run import Engine, Plan
+    from tooltip_cli.stages.shelf.store import Place
     from tooltip_cli.stages.shelf.table import Row
 
 _PART = re.compile(r"(\d+)/(\d+)")
@@ -47,7 +45,12 @@ def _part(
 
 @click.command()
 @click.argument("shelf", metavar="SHELF")
-@rig_option
+@click.option(
+    "--rig",
+    metavar="PLACE",
+    help="Rig file: which frame is the hand, where the camera sits. Default: the one stored in "
+    "each recording.",
+)
 @click.option(
     "--method",
     type=click.Choice(METHODS),
@@ -87,7 +90,11 @@ def _part(
     help="Read finished recordings too and compare their content, where otherwise size and time of "
     "change are believed.",
 )
-@out_option
+@click.option(
+    "--out",
+    metavar="PLACE",
+    help="Folder of the results. Default: 'run' in SHELF, or NAME.run beside a manifest.",
+)
 @topic_options
 @force_option
 @json_option
@@ -95,14 +102,14 @@ def _part(
 def run(
     ctx: click.Context,
     shelf: str,
-    rig: Path | None,
+    rig: str | None,
     method: str,
     jobs: int,
     memory: float | None,
     dask: str | None,
     part: tuple[int, int] | None,
     verify: bool,
-    out: Path | None,
+    out: str | None,
     image: str | None,
     joints: str | None,
     info: str | None,
@@ -118,8 +125,8 @@ def run(
     the results table and does not stop the others. The same command again goes on where it was
     stopped, and tries what failed once more. Exits with 1 when a recording failed.
 
-    Writes results.csv and results.parquet to --out; by default that is the folder 'run' in SHELF,
-    or NAME.run beside a manifest.
+    Writes results.csv and results.parquet to --out. Every place may also be an address such as
+    s3://bucket/folder, gs://... or az://...; credentials are found as the provider's own tools do.
 
     \b
     Examples:
@@ -127,12 +134,13 @@ def run(
       tooltip run 'logs/*/*.mcap' --rig rig.yaml --out results
       tooltip run manifest.csv --part 3/16
       tooltip run /data/shelf --dask tcp://10.0.0.1:8786
+      tooltip run s3://lab/shelf --out s3://lab/results
     """
     from tooltip_cli.log.recording import Topics
     from tooltip_cli.method.estimators import EstimatorParams
-    from tooltip_cli.stages.artifacts import ensure_directory
     from tooltip_cli.stages.shelf.plan import part_of, read_shelf
-    from tooltip_cli.stages.shelf.run import plan_run
+    from tooltip_cli.stages.shelf.run import plan_run, prepare
+    from tooltip_cli.stages.shelf.store import place
 
     if dask not in (None, "local") and memory is not None:
         raise click.UsageError("--memory is for processes started here; Dask's workers have theirs")
@@ -140,19 +148,20 @@ def run(
     items, name = found.items, "results"
     if part is not None:
         items, name = part_of(items, *part), f"results.part-{part[0]}-of-{part[1]}"
-    out = out or found.out
+    results = found.out if out is None else place(out)
     plan = plan_run(
         items,
-        out,
-        rig=rig,
+        results,
+        rig=None if rig is None else place(rig),
         topics=Topics(image=image, joints=joints, info=info, pose=pose),
         params=EstimatorParams(method=method),
         force=force,
         verify=verify,
+        listing=found.listing,
     )
-    ensure_directory(out)  # before any work
+    prepare(plan, results / name)  # before any work
     engine = _engine(dask, jobs, _memory(memory, jobs))
-    rows = _carry_out(plan, engine, jobs, out / name, say if as_json else click.echo)
+    rows = _carry_out(plan, engine, jobs, results / name, say if as_json else click.echo)
     if as_json:
         print_json(rows)
     if rows["failed"]:
@@ -178,7 +187,7 @@ def _memory(gib: float | None, jobs: int) -> int:
 
 
 def _carry_out(
-    plan: Plan, engine: Engine, jobs: int, table: Path, tell: Callable[[str], None]
+    plan: Plan, engine: Engine, jobs: int, table: Place, tell: Callable[[str], None]
 ) -> dict[str, Any]:
     """Do what is left, tell of each recording as it ends, and return the summary."""
     from tooltip_cli.stages.shelf.run import carry_out, write_results
@@ -214,7 +223,7 @@ def _line(row: Row, reused: bool) -> str:
     return f"{row.name}: {text} ({row.seconds or 0:.1f} s{how})"
 
 
-def _summary(rows: Sequence[Row], reused: int, written: Sequence[Path]) -> dict[str, Any]:
+def _summary(rows: Sequence[Row], reused: int, written: Sequence[Place]) -> dict[str, Any]:
     status = Counter(row.status for row in rows)
     return {
         "recordings": len(rows),

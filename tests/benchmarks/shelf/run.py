@@ -74,7 +74,7 @@ def make(folder: Path, size: int) -> Path:
 def synthetic(task: Task, number: int) -> Row:
     """Return a row such as an evaluated recording has, with its tip file."""
     rng = np.random.default_rng(number)
-    tip = task.folder / f"{task.item.recording.stem}.tip.json"
+    tip = Path(str(task.folder)) / f"{task.item.recording.stem}.tip.json"
     tip.parent.mkdir(parents=True, exist_ok=True)
     tip.write_text("{}")
     values = asdict(work_on(replace(task, version="0")).row)
@@ -93,7 +93,7 @@ def one_size(folder: Path, size: int) -> None:
     for number, task in enumerate(plan.tasks):
         store_row(task, synthetic(task, number))
     for task in plan.tasks[::100]:
-        (task.folder / "row.json").unlink()
+        Path(str(task.folder), "row.json").unlink()
     with timed(times, "resume"):
         plan = plan_run(read_shelf(str(shelf)).items, found.out)
     assert len(plan.tasks) == len(range(0, size, 100))
