@@ -19,9 +19,11 @@ from tooltip_cli.cli.options import (
     force_option,
     json_option,
     print_json,
+    progress,
     say,
     topic_options,
 )
+from tooltip_cli.errors import MissingExtraError
 
 if TYPE_CHECKING:
     from tooltip_cli.stages.shelf.run import Engine, Plan
@@ -95,6 +97,12 @@ def _part(
     metavar="PLACE",
     help="Folder of the results. Default: 'run' in SHELF, or NAME.run beside a manifest.",
 )
+@click.option(
+    "--report/--no-report",
+    default=True,
+    show_default=True,
+    help="Whether to write the report over all recordings; never with --part.",
+)
 @topic_options
 @force_option
 @json_option
@@ -110,6 +118,7 @@ def run(
     part: tuple[int, int] | None,
     verify: bool,
     out: str | None,
+    report: bool,
     image: str | None,
     joints: str | None,
     info: str | None,
@@ -125,8 +134,9 @@ def run(
     the results table and does not stop the others. The same command again goes on where it was
     stopped, and tries what failed once more. Exits with 1 when a recording failed.
 
-    Writes results.csv and results.parquet to --out. Every place may also be an address such as
-    s3://bucket/folder, gs://... or az://...; credentials are found as the provider's own tools do.
+    Writes results.csv, results.parquet and a report over all of them to --out. Every place may also
+    be an address such as s3://bucket/folder, gs://... or az://...; credentials are found as the
+    provider's own tools do.
 
     \b
     Examples:
@@ -161,11 +171,54 @@ def run(
     )
     prepare(plan, results / name)  # before any work
     engine = _engine(dask, jobs, _memory(memory, jobs))
-    rows = _carry_out(plan, engine, jobs, results / name, say if as_json else click.echo)
+    tell = say if as_json else click.echo
+    rows, summary = _carry_out(plan, engine, jobs, results / name, tell)
+    if report and part is None:
+        summary["report"] = _report(rows, results, tell)
     if as_json:
-        print_json(rows)
-    if rows["failed"]:
+        print_json(summary)
+    if summary["failed"]:
         ctx.exit(1)
+
+
+def _report(rows: Sequence[Row], results: Place, tell: Callable[[str], None]) -> str | None:
+    """Write the report over all rows and return where it is."""
+    from tooltip_cli.report.shelf_page import headline
+    from tooltip_cli.stages.shelf.summary import REPORT, cells_of, shelf_report, write_report
+
+    gathered = shelf_report(map(cells_of, rows), str(results))
+    try:
+        page = write_report(gathered, results / REPORT)
+    except MissingExtraError as error:
+        say(str(error))
+        return None
+    tell(headline(gathered))
+    tell(str(page))
+    return str(page)
+
+
+def evaluate_shelf(ctx: click.Context, shelf: str, as_json: bool, **options: Any) -> None:
+    """Write the report over a shelf: from its table of results, else after what is left to do."""
+    from tooltip_cli.stages.artifacts import plain
+    from tooltip_cli.stages.shelf import summary
+    from tooltip_cli.stages.shelf.store import place
+
+    path = place(shelf)
+    if path.suffix.lower() not in (".csv", ".parquet") or not summary.is_results(path):
+        ctx.invoke(run, shelf=shelf, as_json=as_json, **options)
+        return
+    out = options["out"]
+    folder = path.parent / summary.REPORT if out is None else place(out)
+    with progress(None, "rows") as advance:
+        gathered = summary.shelf_report(summary.stored_rows(path), str(path), advance)
+    page = summary.write_report(gathered, folder)
+    if as_json:
+        print_json(plain(gathered))
+    else:
+        from tooltip_cli.report.shelf_page import headline
+
+        click.echo(headline(gathered))
+        click.echo(str(page))
 
 
 def _engine(dask: str | None, jobs: int, memory_bytes: int) -> Engine:
@@ -188,9 +241,9 @@ def _memory(gib: float | None, jobs: int) -> int:
 
 def _carry_out(
     plan: Plan, engine: Engine, jobs: int, table: Place, tell: Callable[[str], None]
-) -> dict[str, Any]:
-    """Do what is left, tell of each recording as it ends, and return the summary."""
-    from tooltip_cli.stages.shelf.run import carry_out, write_results
+) -> tuple[Sequence[Row], dict[str, Any]]:
+    """Do what is left, tell of each recording as it ends; return all rows and the summary."""
+    from tooltip_cli.stages.shelf.run import carry_out, in_order, write_results
 
     if plan.finished:
         say(f"{len(plan.finished)} of {len(plan.order)} recordings are finished already")
@@ -203,11 +256,11 @@ def _carry_out(
                 reused += outcome.reused
                 advance(outcome.row.name, partial(tell, _line(outcome.row, outcome.reused)))
     finally:
-        written = write_results(plan, rows, table)
-    everything = [*plan.finished.values(), *rows]
+        everything = in_order(plan, rows)
+        written = write_results(everything, table)
     summary = _summary(everything, reused, written)
     _tell_summary(summary, everything, tell)
-    return summary
+    return everything, summary
 
 
 def _line(row: Row, reused: bool) -> str:

@@ -7,6 +7,7 @@ python tests/benchmarks/shelf/run.py rows FOLDER        planning, resuming, tabl
 from __future__ import annotations
 
 import argparse
+import datetime
 import json
 import resource
 import subprocess
@@ -22,7 +23,8 @@ import numpy as np
 from tooltip_cli.stages.shelf.cluster import on_dask
 from tooltip_cli.stages.shelf.plan import read_shelf
 from tooltip_cli.stages.shelf.pool import on_processes
-from tooltip_cli.stages.shelf.run import plan_run, write_results
+from tooltip_cli.stages.shelf.run import in_order, plan_run, write_results
+from tooltip_cli.stages.shelf.summary import shelf_report, stored_rows, write_report
 from tooltip_cli.stages.shelf.table import Row
 from tooltip_cli.stages.shelf.work import Outcome, Task, store_row, work_on
 
@@ -81,7 +83,22 @@ def synthetic(task: Task, number: int) -> Row:
     numbers = {name: float(rng.normal()) for name in values if name.startswith(("tip_", "cov_"))}
     numbers |= {name: float(rng.gamma(2)) for name in ("error_px", "baseline_px", "seconds")}
     del numbers["tip_error_mm"], numbers["tip_file"]
-    return Row(**{**values, **numbers, "status": "ok", "reason": None, "tip_file": str(tip)})
+    day = number / 40
+    moment = datetime.datetime(2026, 1, 1, tzinfo=datetime.timezone.utc)
+    texts = {
+        "status": "refused" if number % 17 == 3 else "ok",
+        "code": "too_few_views" if number % 17 == 3 else None,
+        "reason": "the wrist hardly turns" if number % 17 == 3 else None,
+        "tip_file": str(tip),
+        "tool": f"tool {number % 12}",
+        "rig_id": f"{number % 3:012x}",
+        "recorded": (moment + datetime.timedelta(days=day)).isoformat(timespec="milliseconds"),
+    }
+    if number % 3 == 1:  # a rig whose camera moves
+        numbers["baseline_px"] *= 1 + day / 200
+    if number % 17 == 3:
+        numbers = {"seconds": numbers["seconds"]}
+    return Row(**{**values, **numbers, **texts})
 
 
 def one_size(folder: Path, size: int) -> None:
@@ -99,7 +116,11 @@ def one_size(folder: Path, size: int) -> None:
     assert len(plan.tasks) == len(range(0, size, 100))
     rows = [Outcome(synthetic(task, number), False).row for number, task in enumerate(plan.tasks)]
     with timed(times, "table"):
-        write_results(plan, rows, found.out / "results")
+        everything = in_order(plan, rows)
+        write_results(everything, found.out / "results")
+    with timed(times, "report"):
+        report = shelf_report(stored_rows(found.out / "results.csv"), "results.csv")
+        write_report(report, found.out / "report")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(json.dumps({"size": size, "peak_mb": peak, **times}))
 
@@ -112,7 +133,7 @@ def rows(folder: Path) -> None:
         done = subprocess.run(command, check=True, capture_output=True, text=True)
         found.append(json.loads(done.stdout))
         print(done.stdout.strip())
-    for name in ("plan", "resume", "table"):
+    for name in ("plan", "resume", "table", "report"):
         slope = np.polyfit(np.log(SIZES), np.log([item[name] for item in found]), 1)[0]
         print(f"{name}: grows with the power {slope:.2f} of the number of rows")
 

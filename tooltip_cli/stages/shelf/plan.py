@@ -10,12 +10,12 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from tooltip_cli.errors import MissingExtraError, TooltipError
 from tooltip_cli.stages.detect import SUFFIX as DETECTIONS
 from tooltip_cli.stages.moving import SUFFIX as EDGES
-from tooltip_cli.stages.shelf.store import Listing, Place, Remote, place, read
+from tooltip_cli.stages.shelf.store import Listing, Place, Remote, opened, place
 from tooltip_cli.stages.shelf.table import COLUMNS
 
 Cell = str | int | float | bool | None
@@ -217,13 +217,9 @@ def _check_columns(path: Place, columns: Sequence[str]) -> None:
         )
 
 
-def _opened(path: Place) -> BinaryIO:
-    return path.open("rb") if isinstance(path, Path) else io.BytesIO(read(path))
-
-
 def _csv_rows(path: Place) -> Iterator[tuple[int, Mapping[str, Any]]]:
     try:
-        with _opened(path) as data:
+        with opened(path) as data:
             file = io.TextIOWrapper(data, encoding="utf-8-sig", newline="")
             reader = csv.DictReader(file, strict=True)
             for row in reader:
@@ -244,7 +240,7 @@ def _parquet_rows(path: Place) -> Iterator[tuple[int, Mapping[str, Any]]]:
     except ImportError:
         raise MissingExtraError("a Parquet manifest", "shelf", "pyarrow") from None
     try:
-        with _opened(path) as data, pyarrow.parquet.ParquetFile(data) as file:
+        with opened(path) as data, pyarrow.parquet.ParquetFile(data) as file:
             line = 0
             for batch in file.iter_batches():
                 for row in batch.to_pylist():

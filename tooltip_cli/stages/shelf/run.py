@@ -250,11 +250,17 @@ def prepare(plan: Plan, table: Place) -> None:
     if isinstance(table, Path):
         ensure_directory(table.parent)
     elif plan.tasks:
-        write_results(plan, (), table)
+        write_results(in_order(plan, ()), table)
 
 
-def write_results(plan: Plan, outcomes: Iterable[Row], path: Place) -> list[Place]:
-    """Write the table of all rows that exist, as ``.csv`` and, with PyArrow, ``.parquet``.
+def in_order(plan: Plan, outcomes: Iterable[Row]) -> list[Row]:
+    """Return all rows that exist in the order of the shelf."""
+    rows = {**plan.finished, **{row.name: row for row in outcomes}}
+    return [rows[name] for name in plan.order if name in rows]
+
+
+def write_results(rows: Sequence[Row], path: Place) -> list[Place]:
+    """Write the table of rows, as ``.csv`` and, with PyArrow, ``.parquet``.
 
     Args:
         path: of the table, without suffix.
@@ -265,12 +271,10 @@ def write_results(plan: Plan, outcomes: Iterable[Row], path: Place) -> list[Plac
     Raises:
         TooltipError: they cannot be written.
     """
-    rows = {**plan.finished, **{row.name: row for row in outcomes}}
-    ordered = [rows[name] for name in plan.order if name in rows]
     written = [path.with_name(f"{path.name}.csv")]
-    write(written[0], csv_table(ordered))
+    write(written[0], csv_table(rows))
     with suppress(MissingExtraError):
-        data = parquet_table(ordered)
+        data = parquet_table(rows)
         written.append(path.with_name(f"{path.name}.parquet"))
         write(written[1], data)
     return written

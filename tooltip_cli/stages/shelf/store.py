@@ -6,12 +6,13 @@ provider's tools do, and nothing here takes, passes on, or repeats any.
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from tooltip_cli.errors import MissingExtraError, TooltipError, one_of
 from tooltip_cli.stages.artifacts import write_whole
@@ -171,6 +172,15 @@ def read(where: Remote) -> bytes:
     with store_errors(where, "read"):
         files, path = _open(where)
         return bytes(files.cat_file(path))
+
+
+def opened(where: Place) -> BinaryIO:
+    """Return a file, or the content of an object, to read from.
+
+    Raises:
+        OSError, TooltipError: it cannot be read.
+    """
+    return where.open("rb") if isinstance(where, Path) else io.BytesIO(read(where))
 
 
 def read_some(places: Iterable[Remote]) -> Iterator[tuple[Remote, bytes]]:

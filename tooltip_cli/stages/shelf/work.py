@@ -20,7 +20,7 @@ from tooltip_cli.log.recording import Recording, Topics, read_recording
 from tooltip_cli.log.views import Views, resolve_rig, resolve_views
 from tooltip_cli.method.estimators import EstimatorParams
 from tooltip_cli.report.model import RecordingReport, mean_of
-from tooltip_cli.stages.artifacts import read_json
+from tooltip_cli.stages.artifacts import digest, read_json
 from tooltip_cli.stages.detect import VERSION as DETECT_VERSION
 from tooltip_cli.stages.estimate import VERSION as ESTIMATE_VERSION
 from tooltip_cli.stages.estimate import Estimated, estimate_from_images
@@ -34,7 +34,7 @@ from tooltip_cli.stages.shelf.store import Place, Remote, Seen, look_at, place, 
 from tooltip_cli.stages.shelf.table import FAILED, OK, Row, row_from_document
 
 ROW = "row.json"
-VERSION = 1
+VERSION = 2
 VERSIONS = (VERSION, DETECT_VERSION, EDGES_VERSION, ESTIMATE_VERSION, EVALUATE_VERSION)
 """Of everything that a row is made by; a row of other versions is made anew."""
 _LOGGER = logging.getLogger(__name__)
@@ -208,7 +208,8 @@ def _one_thread() -> None:
 def _through_the_stages(task: Task, bench: Bench) -> Outcome:
     started = time.perf_counter()
     recording = read_recording(bench.recording, task.topics)
-    views = resolve_views(recording, resolve_rig(recording, bench.rig))
+    rig = resolve_rig(recording, bench.rig)
+    views = resolve_views(recording, rig)
     found = estimate_from_images(
         recording,
         views,
@@ -222,6 +223,7 @@ def _through_the_stages(task: Task, bench: Bench) -> Outcome:
         _bare_row(task),
         **_of_recording(recording),
         **_of_estimate(found),
+        rig_id=digest((replace(rig, source=""), views.camera))[:12],
         seconds_estimate=seconds,
     )
     if bench.labels is None:
