@@ -10,6 +10,7 @@ import argparse
 import datetime
 import json
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -64,6 +65,7 @@ def timed(times: dict[str, float], name: str) -> Iterator[None]:
 def make(folder: Path, size: int) -> Path:
     """Make a shelf of small files, as many as asked for, a hundred in a folder."""
     shelf = folder / f"shelf-{size}"
+    shutil.rmtree(shelf / "run", ignore_errors=True)
     for number in range(size):
         path = shelf / f"{number // 100:04d}" / f"r{number:06d}.mcap"
         path.parent.mkdir(parents=True, exist_ok=True)
