@@ -6,10 +6,11 @@ import csv
 import hashlib
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tests.helpers.logs import write_true_labels
+from tests.helpers.logs import wrist_parts, write_log, write_true_labels
 from tooltip_cli.log.container import LoggedMessage, iterate
 
 TIMED = ("created", "seconds", "seconds_estimate", "seconds_evaluate")
@@ -27,20 +28,22 @@ def make_shelf(folder: Path, wrist: Path, count: int = 3) -> Path:
     return folder
 
 
+def hoard(path: Path) -> Path:
+    """Write a log of less than a megabyte that takes 1.6 GB to read: joint states full of zeros."""
+    parts = wrist_parts()
+    parts["joints"] = [
+        replace(message, payload=message.payload + bytes(8 << 20))
+        for message in parts["joints"][:200]
+    ]
+    return write_log(path, parts)
+
+
 def table(path: Path) -> dict[str, dict[str, str]]:
     """Return the rows of a results table by name, without what depends on the clock."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     return {
         row["name"]: {key: value for key, value in row.items() if key not in TIMED} for row in rows
-    }
-
-
-def artifacts(out: Path) -> dict[str, Any]:
-    """Return every JSON file under a folder of results, without what depends on the clock."""
-    return {
-        str(path.relative_to(out)): _timeless(json.loads(path.read_text()))
-        for path in sorted((out / "recordings").rglob("*.json"))
     }
 
 
