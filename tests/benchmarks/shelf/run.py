@@ -2,6 +2,8 @@
 
 python tests/benchmarks/shelf/run.py engines            overhead of a recording, start-up
 python tests/benchmarks/shelf/run.py rows FOLDER        planning, resuming, tables of 10,000 rows
+python tests/benchmarks/shelf/run.py jobs FOLDER OUT    recordings of FOLDER on one process, on two
+python tests/benchmarks/shelf/run.py bucket FOLDER OUT  the same on one, from a bucket on loopback
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
+import os
 import resource
 import shutil
 import subprocess
@@ -140,15 +143,45 @@ def rows(folder: Path) -> None:
         print(f"{name}: grows with the power {slope:.2f} of the number of rows")
 
 
+def run_shelf(shelf: str, jobs: int, out: Path) -> float:
+    """Run a shelf anew; print wall and processor seconds and return the first."""
+    shutil.rmtree(out, ignore_errors=True)
+    command = [sys.executable, "-m", "tooltip_cli.cli.main", "run", shelf, "--out", str(out)]
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    subprocess.run([*command, "--jobs", str(jobs), "--no-report"], check=True, capture_output=True)
+    wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    user, system = after.ru_utime - before.ru_utime, after.ru_stime - before.ru_stime
+    print(f"{shelf}, {jobs} jobs: {wall:.1f} s wall, {user:.1f} s user, {system:.1f} s system")
+    return wall
+
+
+def from_bucket(folder: Path, out: Path) -> None:
+    """Print what a shelf takes from a folder and from a bucket of a server on this machine."""
+    sys.path.insert(0, str(Path(__file__).parents[3]))
+    from tests.helpers.bucket import BUCKET, environment, serve
+
+    run_shelf(str(folder), 1, out)
+    with serve() as server:
+        server.upload(folder, "shelf")
+        os.environ.update(environment(server.port))
+        run_shelf(f"s3://{BUCKET}/shelf", 1, out)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("engines", "rows", "one"))
+    parser.add_argument("what", choices=("engines", "rows", "one", "jobs", "bucket"))
     parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("out", type=Path, nargs="?")
     parser.add_argument("--size", type=int)
     given = parser.parse_args()
     if given.what == "engines":
         engines()
     elif given.what == "rows":
         rows(given.folder)
+    elif given.what == "jobs":
+        one, two = (run_shelf(str(given.folder), jobs, given.out) for jobs in (1, 2))
+        print(f"two processes are {one / two:.2f} times one")
+    elif given.what == "bucket":
+        from_bucket(given.folder, given.out)
     else:
         one_size(given.folder, given.size)
