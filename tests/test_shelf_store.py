@@ -180,6 +180,18 @@ def test_a_pattern_in_a_bucket(bucket: Server, pattern: str, names: list[str]) -
         read_shelf("s3://la*/a.mcap")
 
 
+def test_names_are_taken_as_they_are(bucket: Server, wrist_file: Path, tmp_path: Path) -> None:
+    odd = "a[1] ä*?.mcap"
+    for key in (f"odd/{odd}", "odd2/other.mcap"):
+        bucket.client().upload_file(str(wrist_file), BUCKET, key)
+    bucket.client().put_object(Bucket=BUCKET, Key="odd/folder/", Body=b"")
+    done = run(f"s3://{BUCKET}/odd")
+    assert "1 recordings: 1 ok, 0 refused, 0 failed; 0 reused" in done.out, done.err
+    (row,) = table(bucket.objects("odd/run")["results.csv"].decode())
+    assert row["recording"] == f"s3://{BUCKET}/odd/{odd}"
+    assert "1 of 1 recordings are finished already" in run(f"s3://{BUCKET}/odd").err
+
+
 def test_a_cut_connection_leaves_no_half_object(bucket: Server, monkeypatch: Any) -> None:
     big = Remote(f"s3://{BUCKET}/cut/big")
     write(big, b"a" * 3_000_000)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +29,8 @@ EXTRAS = {
 """Protocol -> the extra that it needs and the module behind it."""
 _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://(.*)", re.DOTALL)
 _VERSION_KEYS = ("ETag", "etag", "generation", "md5Hash", "LastModified", "last_modified")
-_AT_ONCE = 256  # small objects asked for side by side
+_AT_ONCE = 32  # requests for small objects side by side
+_BATCH = 1024  # of them held at once
 _SECRETS = (
     (re.compile(r"(?<=://)[^/\s@]*:[^/\s@]*@"), "***@"),
     (re.compile(r"\?[^\s\"'<>)]+"), "?***"),
@@ -184,23 +186,28 @@ def opened(where: Place) -> BinaryIO:
 
 
 def read_some(places: Iterable[Remote]) -> Iterator[tuple[Remote, bytes]]:
-    """Yield those small objects of one store that are there; many are asked for side by side.
+    """Yield those small objects that are there, in order; many are asked for side by side.
 
     Raises:
         TooltipError: the store does not answer.
     """
     wanted = list(places)
-    for start in range(0, len(wanted), _AT_ONCE):
-        with store_errors(wanted[start], "read"):
-            some = {_open(where)[1]: where for where in wanted[start : start + _AT_ONCE]}
-            files, _ = _open(wanted[start])
-            answers = files.cat(list(some), on_error="return")
-            for answer in answers.values():
-                if not isinstance(answer, (bytes, FileNotFoundError)):
-                    raise answer
-        for path, answer in answers.items():
-            if isinstance(answer, bytes):
-                yield some[path], answer
+    # fsspec's own way to ask for many takes [ and * in names for patterns
+    with ThreadPoolExecutor(_AT_ONCE) as threads:
+        for start in range(0, len(wanted), _BATCH):
+            some = wanted[start : start + _BATCH]
+            for where, data in zip(some, threads.map(_read_if_there, some), strict=True):
+                if data is not None:
+                    yield where, data
+
+
+def _read_if_there(where: Remote) -> bytes | None:
+    with store_errors(where, "read"):
+        files, path = _open(where)
+        try:
+            return bytes(files.cat_file(path))
+        except FileNotFoundError:
+            return None
 
 
 def look_at(where: Remote) -> Seen | None:
