@@ -17,6 +17,7 @@ import pytest
 
 from tests.helpers.bucket import BUCKET, KEY, SECRET, Cutter, Server, environment, serve, use
 from tests.helpers.cli import Outcome, tooltip
+from tests.helpers.cluster import Cluster
 from tests.helpers.logs import wrist_parts, write_log
 from tests.helpers.robot import RIG
 from tests.helpers.shelves import METHOD, TIMED, contents, make_shelf
@@ -134,6 +135,23 @@ class Counted(Cutter):
         words = request.split(b"\r\n", 1)[0].decode().split()
         if words[0] == "GET" and "?" not in words[1]:
             self.seen.add(words[1].rpartition("/")[2])
+
+
+def test_workers_of_a_cluster_fetch_for_themselves(
+    bucket: Server, wrist_file: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("distributed")
+    bucket.upload(make_shelf(tmp_path / "shelf", wrist_file, 2), "dask")
+    cluster = Cluster(tmp_path)
+    try:
+        cluster.start(1)
+        done = tooltip("run", f"s3://{BUCKET}/dask", *METHOD, "--dask", cluster.address)
+    finally:
+        cluster.stop()
+    assert "3 recordings: 2 ok, 0 refused, 1 failed; 0 reused" in done.out, done.err
+    cluster_rows = table(bucket.objects("dask/run")["results.csv"].decode())
+    run(f"s3://{BUCKET}/dask", "--force")
+    assert table(bucket.objects("dask/run")["results.csv"].decode()) == cluster_rows
 
 
 def test_a_manifest_names_places_anywhere(bucket: Server, wrist_file: Path, tmp_path: Path) -> None:

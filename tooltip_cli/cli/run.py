@@ -159,16 +159,18 @@ def run(
     if part is not None:
         items, name = part_of(items, *part), f"results.part-{part[0]}-of-{part[1]}"
     results = found.out if out is None else place(out)
-    plan = plan_run(
-        items,
-        results,
-        rig=None if rig is None else place(rig),
-        topics=Topics(image=image, joints=joints, info=info, pose=pose),
-        params=EstimatorParams(method=method),
-        force=force,
-        verify=verify,
-        listing=found.listing,
-    )
+    with progress(len(items), "plan, rows") as advance:
+        plan = plan_run(
+            items,
+            results,
+            rig=None if rig is None else place(rig),
+            topics=Topics(image=image, joints=joints, info=info, pose=pose),
+            params=EstimatorParams(method=method),
+            force=force,
+            verify=verify,
+            listing=found.listing,
+            on_row=advance,
+        )
     prepare(plan, results / name)  # before any work
     engine = _engine(dask, jobs, _memory(memory, jobs))
     tell = say if as_json else click.echo

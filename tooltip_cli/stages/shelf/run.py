@@ -58,6 +58,7 @@ def plan_run(
     force: bool = False,
     verify: bool = False,
     listing: Listing | None = None,
+    on_row: Callable[[], None] = lambda: None,
 ) -> Plan:
     """Find out what is left to do, without opening a recording.
 
@@ -70,6 +71,7 @@ def plan_run(
         force: compute everything anew.
         verify: take no stored row; every recording is read and compared by its content.
         listing: what is known already of the buckets that recordings lie in.
+        on_row: called for each stored row that was looked for.
 
     Raises:
         TooltipError: a store does not answer.
@@ -102,7 +104,7 @@ def plan_run(
                 beside=look.beside(chosen),
             )
         )
-    finished = look.finished(everything, out) if trust else {}
+    finished = look.finished(everything, out, on_row) if trust else {}
     return Plan(
         tuple(item.name for item in items),
         finished,
@@ -156,19 +158,26 @@ class _Look:
             found += [item.labels.with_name(name) for name in names]
         return tuple(found)
 
-    def finished(self, tasks: Sequence[Task], out: Place) -> dict[str, Row]:
+    def finished(
+        self, tasks: Sequence[Task], out: Place, on_row: Callable[[], None]
+    ) -> dict[str, Row]:
         """Return by name the rows that are stored and still hold."""
+        finished: dict[str, Row] = {}
         if isinstance(out, Path):
-            rows = ((task, stored_row(task.folder, task.inputs)) for task in tasks)
-            return {task.item.name: row for task, row in rows if row is not None}
+            for task in tasks:
+                row = stored_row(task.folder, task.inputs)
+                if row is not None:
+                    finished[task.item.name] = row
+                on_row()
+            return finished
         self._listing.add_tree(out / "recordings")
         stored = {task.folder / ROW: task for task in tasks if self._is_there(task.folder / ROW)}
-        finished = {}
         wanted = [where for where in stored if isinstance(where, Remote)]
         for where, data in read_some(wanted):
             row = row_of(parsed(data), stored[where].inputs, where.parent)
             if row is not None and row.tip_file is not None and self._is_there(place(row.tip_file)):
                 finished[stored[where].item.name] = row
+            on_row()
         return finished
 
     def _is_there(self, where: Place) -> bool:
