@@ -47,11 +47,11 @@ def recordings_argument(command: _Command) -> _Command:
         required=True,
         type=PATH,
         metavar="REC...",
-        callback=lambda ctx, parameter, paths: _without_results(paths),
+        callback=lambda ctx, parameter, paths: without_results(paths),
     )(command)
 
 
-def _without_results(paths: tuple[Path, ...]) -> tuple[Path, ...]:
+def without_results(paths: tuple[Path, ...]) -> tuple[Path, ...]:
     """Leave out our own results, so that ``*.mcap`` still means the recordings beside them."""
     kept = tuple(path for path in paths if not path.name.endswith(_RESULTS))
     return kept or paths

@@ -247,7 +247,8 @@ def evaluate_recording(
     stored = None if force else _stored(place, key)
     if stored is not None:
         on_step(path, f"reused {place}")
-        return Evaluated(*stored, True, scene)
+        row, table = stored  # perhaps of the time when it lay elsewhere
+        return Evaluated(replace(row, recording=str(path)), table, True, scene)
     case = Case(
         recording,
         rig,
@@ -331,7 +332,7 @@ def _key(
     parents["label_set"] = digest(None if labelled is None else labelled.described)
     parents["states"] = digest(None if labelled is None else labelled.states)
     parents["truth"] = digest(truth)
-    parents["name"] = str(recording.path)
+    parents["name"] = recording.path.stem
     return stage_key("evaluate", VERSION, parents, protocol)
 
 
