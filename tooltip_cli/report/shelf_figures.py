@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tooltip_cli.report.bars import shortened
 from tooltip_cli.report.charts import (
     BASELINE,
     DETECTOR,
@@ -19,7 +20,6 @@ from tooltip_cli.report.charts import (
     bare,
     styled,
 )
-from tooltip_cli.report.figures import shortened
 from tooltip_cli.report.shelf_model import Counts, Group, Period, ShelfReport
 from tooltip_cli.report.tables import number
 
