@@ -266,12 +266,12 @@ def test_what_voting_saw_is_kept_and_new_labels_cost_no_estimate(
     assert first.detector.position_m is not None
     assert [point.frames for point in first.training][:1] == [50]
     seen = json.loads((tmp_path / "r" / "tips" / "shape" / "wrist.shape.json").read_text())
-    # hand and tool are a stick from the wrist to the tip
+    # the tool is a stick whose other end lies 2 cm beside the hand's origin
     along = np.array(seen["points"]) @ TIP / np.linalg.norm(TIP)
     away = np.linalg.norm(
         np.array(seen["points"]) - along[:, None] * TIP / np.linalg.norm(TIP), axis=1
     )
-    assert np.median(away) < 0.01
+    assert np.median(away) < 0.015
     assert along.max() == pytest.approx(np.linalg.norm(TIP), abs=0.02)
 
     def never(*_: object) -> None:
