@@ -19,7 +19,7 @@ import pytest
 
 from tests.helpers.cli import tooltip
 from tests.helpers.live import MjpegServer, free_port, play, played, udp_joints
-from tests.helpers.logs import FRAME_NS, image_message, logged_image, stamp_of, wrist_parts
+from tests.helpers.logs import FRAME_NS, image_message, jpeg_of, logged_image, stamp_of, wrist_parts
 from tests.helpers.robot import CAMERA, CAMERA_FRAME, RIG
 from tests.test_stage_voting import simulate, truth
 from tooltip_cli.errors import TooltipError
@@ -367,6 +367,20 @@ def test_a_damaged_image_is_left_out_with_those_that_need_it() -> None:
     keeper = keeper_of(messages)
     assert 1 <= keeper.unreadable <= 15
     assert keeper.held == whole.held - keeper.unreadable
+
+
+@pytest.mark.parametrize("apart_s", [-100, 100])
+def test_clocks_that_are_apart_are_pointed_out(apart_s: int) -> None:
+    messages = messages_of(40)
+    for i, message in enumerate(messages):
+        if message.datatype == COMPRESSED_IMAGE:
+            stamp_ns = message.log_time_ns + apart_s * 10**9
+            messages[i] = replace(image_message(stamp_ns, jpeg_of(0)), log_time_ns=stamp_ns)
+    follower = keeper_of(messages).follower
+    follower.passed(at_end=True)
+    assert f"stamped {apart_s - 0.1:+.1f} s off the latest joints" in follower.missing
+    whole = keeper_of(messages_of(40)).follower
+    assert whole.missing == ""
 
 
 def test_raw_images_are_held_as_jpeg() -> None:

@@ -55,6 +55,8 @@ class PoseFollower:
         self._samples: list[tuple[float, ...]] = []  # joints, or a pose
         self._images: deque[tuple[int, Message | None]] = deque(maxlen=_PENDING)
         self._other_joints: tuple[str, ...] = ()
+        self._last_image_ns: int | None = None  # on the joints' clock
+        self._met = False  # whether an image's pose was ever known
 
     @property
     def missing(self) -> str:
@@ -63,8 +65,14 @@ class PoseFollower:
             return "no intrinsics, neither in the rig nor as CameraInfo"
         if not self.ready:
             return "no robot description or no image was heard"
-        if self._stamps:
+        if self._met or (self._stamps and self._last_image_ns is None):
             return ""
+        if self._stamps and self._last_image_ns is not None:
+            apart_s = (self._last_image_ns - self._stamps[-1]) / 1e9
+            return (
+                f"the latest image is stamped {apart_s:+.1f} s off the latest joints or pose, and "
+                "none lies between two of these; check the clocks, or set time_offset in the rig"
+            )
         if self._rig.pose_topic is not None:
             return f"no hand pose on {self._rig.pose_topic}"
         if self._other_joints:
@@ -116,14 +124,17 @@ class PoseFollower:
             return []
         images.sort(key=lambda image: image[0])
         query = np.array([stamp_ns + shift for stamp_ns, _ in images], dtype=np.int64)
+        poses, turns = self._poses(query)
+        self._met |= bool(np.isfinite(poses).all(axis=(1, 2)).any())
         return [
             PosedImage(stamp_ns, pose, turned, message)
-            for (stamp_ns, message), pose, turned in zip(images, *self._poses(query), strict=True)
+            for (stamp_ns, message), pose, turned in zip(images, poses, turns, strict=True)
         ]
 
     def _take_image(self, message: Message) -> None:
         stamp_ns = header_stamp_ns(message.payload)
         if stamp_ns is not None:
+            self._last_image_ns = stamp_ns + round(self._rig.time_offset_s * 1e9)
             self._images.append((stamp_ns, message if self._keep else None))
         if self._image_frame is None and self._rig.camera_frame is None:
             self._image_frame = str(decode(message.datatype, message.payload).header.frame_id)
