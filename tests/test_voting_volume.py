@@ -203,7 +203,7 @@ def test_every_cell_knows_its_nearest_edge(small: HandEdges) -> None:
     rng = np.random.default_rng(3)
     crowded = rng.uniform(-0.05, 0.05, (240, 2))
     rows = small.moving.frame_of_edge
-    raster, nearest = volume._nearest_edges(small, crowded, rows)
+    raster, nearest = volume._nearest_edges(small, crowded, rows, len(small.moving.frames))
     cells = np.round(raster[0] * crowded - raster[1:]).astype(int)
     for row, v, u in np.argwhere(nearest >= 0)[::7]:
         mine = np.abs(cells[rows == row] - (u, v))

@@ -9,13 +9,15 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from tooltip_cli import machine_code
 from tooltip_cli.method.rays import plausible
-from tooltip_cli.method.types import Array
+from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.end import Shape
 from tooltip_cli.method.voting.params import HullParams
 from tooltip_cli.method.voting.silhouette import FOREGROUND, UNKNOWN, HandSilhouettes, Image
-from tooltip_cli.method.voting.volume import grid_axis
+from tooltip_cli.method.voting.volume import KERNELS, grid_axis
 
+_CARVER = "f64* i64 f64* u8* i64* i64 i64 i64 i64 i32* i32*"
 _MIN_VOXELS = 8  # smaller pieces are specks
 _CHILDREN = np.array(np.meshgrid(*[[-0.25, 0.25]] * 3)).reshape(3, -1).T
 
@@ -43,12 +45,9 @@ def visual_hull(
 
 def missing(silhouettes: HandSilhouettes, points: Array) -> Array:
     """Return (P,) the share of the images that show the background at points (P, 3), hand frame."""
-    from tooltip_cli.method._voting_numba import carve_kernel
-
     cameras = np.ascontiguousarray(silhouettes.view @ silhouettes.camera_from_hand[:, :3])
-    inside, carved = np.zeros((2, len(points)), dtype=np.int32)
     masks = np.ascontiguousarray(silhouettes.masks)
-    carve_kernel()(np.ascontiguousarray(points), cameras, masks, len(masks), inside, carved)
+    inside, carved = _carve(points, cameras, masks, np.arange(len(masks)), len(masks))
     return np.asarray(carved / np.maximum(inside + carved, 1))
 
 
@@ -71,7 +70,7 @@ def _where_the_hand_hides(
                     cv2.circle(hand, (round(u), round(v)), round(size), 1, -1)
         covered += hand
     hidden = covered > params.max_cover * len(camera_from_hand)
-    return np.where(hidden[None], np.uint8(UNKNOWN), masks)
+    return np.where(hidden, np.uint8(UNKNOWN), masks) if hidden.any() else masks
 
 
 def _uncarved(
@@ -80,31 +79,42 @@ def _uncarved(
     """Return (V,) which voxels stay, and (V,) how many silhouettes each lies in."""
     import cv2
 
-    from tooltip_cli.method._voting_numba import carve_kernel
-
     ahead = cameras[:, 2, 3]
     scale = float(np.median(cameras[:, 0, 0] ** 2 + cameras[:, 0, 1] ** 2 + cameras[:, 0, 2] ** 2))
     pixels = scale**0.5 / float(np.median(ahead)) * size
     side = 2 * max(1, round(params.margin * pixels)) + 1
     square = np.ones((side, side), np.uint8)
-    wide = np.stack(
-        [np.maximum(mask, cv2.dilate((mask == FOREGROUND) * mask, square)) for mask in masks]
-    )
+    wide = np.empty_like(masks)
+    for mask, wider in zip(masks, wide, strict=True):
+        np.maximum(mask, cv2.dilate((mask == FOREGROUND) * mask, square), out=wider)
     order = np.random.default_rng(0).permutation(len(wide))  # unlike views carve soonest
-    inside = np.zeros(len(voxels), dtype=np.int32)
-    carved = np.zeros(len(voxels), dtype=np.int32)
     limit = int(params.max_missing * len(wide))
-    carve_kernel()(
+    inside, carved = _carve(voxels, cameras, wide, order, limit)
+    said = inside + carved
+    kept = (said >= params.min_seen * len(wide)) & (carved <= params.max_missing * said)
+    return kept, inside
+
+
+def _carve(
+    voxels: Array, cameras: Array, masks: Image, order: Indices, limit: int
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+    """Return (V,) the masks in which each voxel is foreground and in which it is background.
+
+    They are looked at in this order, until more than ``limit`` show background.
+    """
+    inside, carved = np.zeros((2, len(voxels)), dtype=np.int32)
+    machine_code.kernel(KERNELS, "carver", _CARVER)(
         np.ascontiguousarray(voxels),
-        np.ascontiguousarray(cameras[order]),
-        np.ascontiguousarray(wide[order]),
+        len(voxels),
+        cameras,
+        masks,
+        order,
+        *masks.shape,
         limit,
         inside,
         carved,
     )
-    said = inside + carved
-    kept = (said >= params.min_seen * len(wide)) & (carved <= params.max_missing * said)
-    return kept, inside
+    return inside, carved
 
 
 def _pieces(voxels: Array, frames: npt.NDArray[np.int32], spheres: Array, size: float) -> Shape:

@@ -11,11 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tooltip_cli import machine_code
 from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.params import RefineParams
 from tooltip_cli.method.voting.silhouette import HandSilhouettes
-from tooltip_cli.method.voting.volume import Cloud, HandEdges
+from tooltip_cli.method.voting.volume import KERNELS, Cloud, HandEdges
 
+_CHOOSER = (
+    "f64* i64* f32* f64* f64* i64 i64 f64* f64* f64* f64* f64* f64* "
+    "f64 f64 f64 f64 f64 i64* f64* f64* f64*"
+)
 _FARTHEST = 3  # edges of a frame, whose median is its farthest one
 
 
@@ -234,16 +239,15 @@ def _on_tool(
         of each edge its frame's row, metres along the axis in the image, metres across, and
         metres along the axis itself.
     """
-    from tooltip_cli.method._voting_numba import on_tool_kernel
-
     rows = np.empty(len(near.rows), dtype=np.intp)
     along, across, lengthwise = np.empty((3, len(near.rows)))
-    count = on_tool_kernel()(
+    count = machine_code.kernel(KERNELS, "chooser", _CHOOSER)(
         near.pixels,
         near.rows,
         near.profiles,
         near.first,
         near.step,
+        *near.profiles.shape,
         sight.pixel,
         sight.along,
         sight.scale,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from tooltip_cli import machine_code
 from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.moving import MovingEdges
 from tooltip_cli.method.voting.params import VotingParams
@@ -23,6 +24,14 @@ _CELL_PX = 2.0  # pixels a side of the cells in which the edge nearest to a voxe
 _SMEAR = 1  # cells around an edge within which a voxel counts as near it
 _SUBSTEPS = 3  # depths tried between two samples of a profile, once the volume is fine
 _FINE_SCORE = 0.02  # share of expected frames, in the fine volume
+
+KERNELS = "tooltip_cli.method._voting_numba"
+_PROFILER = "f64* f64* f32* f64* i64* i64 f64* f64* i64 f64 f64 f32*"
+_VOTER = (
+    "f64* i64 f64 f64* f64* i64 f64 f64 f64 i64 i64 i32* f32* i64 f64* f64 f64 "
+    "f64* i64* f64* f32* f32*"
+)
+_PLACER = "f64* i64* f32* i64 i64 f64* f64* f32* i64 f64 f64 f64 i64 f64* f64*"
 
 
 @dataclass(frozen=True)
@@ -115,21 +124,21 @@ def _depth_ranges(edges: HandEdges, params: VotingParams) -> Array:
 def _depth_profiles(
     edges: HandEdges, rows: Indices, depths: Array, params: VotingParams
 ) -> npt.NDArray[np.float32]:
-    from tooltip_cli.method._voting_numba import profile_kernel
-
     moving = edges.moving
     camera = edges.camera_from_hand
     hand_from_camera = np.linalg.inv(camera[moving.frames])
     between = camera[moving.partners] @ hand_from_camera[:, None]
     profiles = np.zeros((len(rows), params.depths), dtype=np.float32)
-    profile_kernel()(
+    machine_code.kernel(KERNELS, "profiler", _PROFILER)(
         edges.points,
         np.ascontiguousarray(edges.focal_px * edges.moved),
         moving.covariances,
         np.ascontiguousarray(edges.focal_px * edges.background),
         rows.astype(np.int64),
+        len(rows),
         np.ascontiguousarray(between),
         depths,
+        params.depths,
         params.clip,
         params.prediction_variance,
         profiles,
@@ -145,26 +154,32 @@ def _vote(
     depths: Array,
     params: VotingParams,
 ) -> tuple[Volume, Volume]:
-    from tooltip_cli.method._voting_numba import vote_kernel
-
     axis = grid_axis(edges.reach, params.coarse)
     hits = np.zeros((len(axis),) * 3, dtype=np.float32)
     expected = np.zeros_like(hits)
     every = max(1, round(len(edges.moving.frames) / _VOTING_FRAMES))
     voting = rows % every == 0
-    raster, nearest = _nearest_edges(edges, points[voting], rows[voting] // every)
     camera = edges.camera_from_hand[:, :3]
-    vote_kernel()(
+    frames, n = edges.moving.frames[::every], len(axis)
+    raster, nearest = _nearest_edges(edges, points[voting], rows[voting] // every, len(frames))
+    machine_code.kernel(KERNELS, "voter", _VOTER)(
         axis,
+        n,
         edges.reach,
-        np.ascontiguousarray(camera[edges.moving.frames[::every]]),
+        np.ascontiguousarray(camera[frames]),
         np.ascontiguousarray(camera[edges.moving.partners[::every, 1]]),
-        raster,
-        nearest[: len(edges.moving.frames[::every])],
+        len(frames),
+        *raster,
+        *nearest.shape[1:],
+        nearest,
         np.ascontiguousarray(profiles[voting]),
+        profiles.shape[1],
         np.ascontiguousarray(depths[::every]),
         _LEAST_MOTION_PX / _CELL_PX,
         _FULL_RATIO,
+        np.empty(n),
+        np.empty((n, 2), np.int64),
+        np.empty((2, n, n)),
         hits,
         expected,
     )
@@ -172,13 +187,13 @@ def _vote(
 
 
 def _nearest_edges(
-    edges: HandEdges, points: Array, rows: Indices
+    edges: HandEdges, points: Array, rows: Indices, frames: int
 ) -> tuple[Array, npt.NDArray[np.int32]]:
     """Return the raster (focal, u0, v0) in cells and (F, H, W) each cell's nearest edge, or -1."""
     focal = edges.focal_px / _CELL_PX
     low, high = focal * edges.extent
     width, height = (np.ceil(high - low) + 1).astype(int)
-    nearest = np.full((len(edges.moving.frames), height, width), -1, dtype=np.int32)
+    nearest = np.full((frames, height, width), -1, dtype=np.int32)
     columns, lines = np.round(focal * points - low).astype(int).T
     reach = range(-_SMEAR, _SMEAR + 1)
     offsets = [(du, dv) for du in reach for dv in reach]
@@ -202,25 +217,24 @@ def _place(
     substeps: int = 1,
 ) -> tuple[Array, Array]:
     """Return (E, 3) positions in the hand frame and (E,) the volume's score there; 0: nowhere."""
-    from tooltip_cli.method._voting_numba import place_kernel
-
     positions = np.zeros((len(points), 3))
-    scores, ratios = np.zeros(len(points)), np.zeros(len(points))
+    scores = np.zeros(len(points))
     hand_from_camera = np.linalg.inv(edges.camera_from_hand[edges.moving.frames])
-    place_kernel()(
+    machine_code.kernel(KERNELS, "placer", _PLACER)(
         np.ascontiguousarray(points),
         rows.astype(np.int64),
         np.ascontiguousarray(profiles),
+        *profiles.shape,
         np.ascontiguousarray(hand_from_camera),
         depths,
         volume,
+        len(volume),
         float(grid_axis(edges.reach, step)[0]),
         step,
         params.volume_weight,
         substeps,
         positions,
         scores,
-        ratios,
     )
     return positions, scores
 
