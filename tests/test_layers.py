@@ -44,11 +44,13 @@ HEAVY = (
     "pinocchio",
     "pyarrow",
     "rosbags",
+    "rtde_receive",
     "scipy",
     "skimage",
     "starlette",
     "trimesh",
     "uvicorn",
+    "zenoh",
 )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tooltip_cli.cli.options import PATH, jobs_option, progress, say, topic_options
-from tooltip_cli.cli.record_live import camera, list_, ros2
+from tooltip_cli.cli.record_live import camera, list_, ros1, ros2, zenoh
 from tooltip_cli.cli.recording import (
     finish,
     load_rig_file,
@@ -46,6 +46,8 @@ def record() -> None:
 
 record.add_command(camera)
 record.add_command(ros2)
+record.add_command(zenoh)
+record.add_command(ros1)
 record.add_command(list_)
 
 
