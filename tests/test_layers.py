@@ -44,7 +44,6 @@ HEAVY = (
     "pinocchio",
     "pyarrow",
     "rosbags",
-    "rtde_receive",
     "scipy",
     "skimage",
     "starlette",

@@ -92,8 +92,8 @@ def live_options(command: _Command) -> _Command:
 @click.option(
     "--joints",
     metavar="SOURCE",
-    help="udp://HOST:PORT or tcp://HOST:PORT with JSON lines, a CSV file that grows, or a Python "
-    "object module:factory.",
+    help="udp://HOST:PORT or tcp://HOST:PORT with JSON lines, rtde://HOST of a UR robot, a CSV "
+    "file that grows, or a Python object module:factory.",
 )
 @click.option(
     "--joint-stamps",
@@ -134,6 +134,7 @@ def camera(
     Examples:
       tooltip record camera pliers.mcap --camera 0 --joints udp://:9870 --rig rig.yaml
       tooltip record camera pliers.mcap --camera http://head/stream --joints tcp://robot:9870
+      tooltip record camera pliers.mcap --camera /dev/video2 --joints rtde://192.168.0.10
       tooltip record camera pliers.mcap --camera rtsp://head/live --joints arm:joints --duration 15
     """
     from tooltip_cli.sources.camera import CameraSource
