@@ -6,10 +6,7 @@ that need them skip where they are not installed. Others speak to a master writt
 
 from __future__ import annotations
 
-import functools
 import json
-import os
-import shutil
 import signal
 import socket
 import struct
@@ -28,8 +25,15 @@ pytest.importorskip("rosbags")
 from tests.helpers import ros1_robot
 from tests.helpers.cli import tooltip
 from tests.helpers.live import free_port
-from tests.helpers.recorder import ROOT, by_topic, ended, grown, recorder, wait_for
+from tests.helpers.recorder import by_topic, ended, grown, recorder, wait_for
 from tests.helpers.robot import CAMERA_FRAME, JOINTS, URDF
+from tests.helpers.robots import (
+    SYSTEM_PYTHON,
+    Network,
+    has_ros1,
+    ros1_environment,
+    ros1_master,
+)
 from tests.helpers.ros1_robot import DESCRIPTION, IMAGE, INFO, PICTURES, RAW, STATES
 from tooltip_cli.log import messages
 from tooltip_cli.log.messages import Message, decode
@@ -40,56 +44,20 @@ from tooltip_cli.sources.live import ArrivalClock
 from tooltip_cli.sources.ros1 import Ros1Bus
 from tooltip_cli.sources.ros1types import definition_sum
 
-SYSTEM_PYTHON = "/usr/bin/python3"
-
-
-@functools.cache
-def no_ros1() -> bool:
-    """Return whether the master or rospy is missing."""
-    if shutil.which("rosmaster") is None or not Path(SYSTEM_PYTHON).exists():
-        return True
-    command = [SYSTEM_PYTHON, "-c", "import rospy, sensor_msgs.msg"]
-    return subprocess.run(command, capture_output=True, check=False).returncode != 0
-
-
 needs_ros1 = pytest.mark.skipif(
-    no_ros1(), reason="needs Debian's python3-rosmaster, python3-rospy and python3-sensor-msgs"
+    not has_ros1(), reason="needs Debian's python3-rosmaster, python3-rospy and python3-sensor-msgs"
 )
 
 
 @pytest.fixture
-def master(tmp_path: Path) -> Iterator[str]:
-    port = free_port()
-    with (tmp_path.parent / "master.log").open("w") as log:
-        process = subprocess.Popen(
-            ["rosmaster", "--core", "-p", str(port)],
-            stdout=log,
-            stderr=log,
-            env={**os.environ, "ROS_LOG_DIR": str(tmp_path.parent), "ROS_IP": "127.0.0.1"},
-        )
-        uri = f"http://127.0.0.1:{port}"
-        wait_for(lambda: socket.socket().connect_ex(("127.0.0.1", port)) == 0, "a master")
+def master() -> Iterator[str]:
+    with ros1_master() as (uri, _):
         yield uri
-        process.terminate()
-        process.wait(30)
 
 
-def robot(master: str, logs: Path, *arguments: object) -> subprocess.Popen[str]:
-    ros = {"ROS_MASTER_URI": master, "ROS_IP": "127.0.0.1", "ROS_LOG_DIR": str(logs.parent)}
-    command = [SYSTEM_PYTHON, "tests/helpers/ros1_robot.py", *map(str, arguments)]
-    process = subprocess.Popen(
-        command,
-        cwd=ROOT,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, **ros},
-    )
-    assert process.stdin is not None
-    process.stdin.write(URDF)
-    process.stdin.close()
-    process.stdin = None
-    return process
+def robot(master: str, *arguments: object) -> subprocess.Popen[str]:
+    command = [SYSTEM_PYTHON, "tests/helpers/ros1_robot.py"]
+    return Network([], command, ros1_environment(master)).start(*arguments)
 
 
 def image_payload(kind: str, width: int, height: int, fps: float, number: int) -> bytes:
@@ -112,7 +80,7 @@ def test_every_message_arrives_as_ros2_has_it(
     kind: str, topic: str, datatype: str, master: str, tmp_path: Path
 ) -> None:
     out = tmp_path / "out.mcap"
-    sender = robot(master, tmp_path, kind, 320, 240, 30, 200, 2.0)
+    sender = robot(master, kind, 320, 240, 30, 200, 2.0)
     names = ("--image", topic, "--joints", STATES, "--patience", 3)
     listener = recorder("ros1", out, "--master", master, *names)
     sent, _ = sender.communicate(timeout=90)
@@ -136,7 +104,7 @@ def test_every_message_arrives_as_ros2_has_it(
 @needs_ros1
 def test_topics_are_found_with_the_latched_and_the_description(master: str, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
-    sender = robot(master, tmp_path, "jpeg", 64, 48, 30, 100, 2.0)
+    sender = robot(master, "jpeg", 64, 48, 30, 100, 2.0)
     wait_for(lambda: INFO in [topic.name for topic in Ros1Bus(master).heard(0)], "the robot")
     listener = recorder("ros1", out, "--master", master, "--patience", 3)
     sender.communicate(timeout=90)
@@ -153,13 +121,13 @@ def test_topics_are_found_with_the_latched_and_the_description(master: str, tmp_
 def test_a_node_that_is_killed_and_restarted_is_heard_again(master: str, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     names = ("--image", IMAGE, "--joints", STATES, "--reconnect")
-    first = robot(master, tmp_path, "jpeg", 64, 48, 30, 100, 60)
+    first = robot(master, "jpeg", 64, 48, 30, 100, 60)
     listener = recorder("ros1", out, "--master", master, *names)
     wait_for(grown(out, 20_000), "a recording")
     first.kill()  # the master goes on naming it
     first.communicate()
     time.sleep(2)  # so that the silence is noticed
-    second = robot(master, tmp_path, "jpeg", 64, 48, 30, 100, 1.5)
+    second = robot(master, "jpeg", 64, 48, 30, 100, 1.5)
     second.communicate(timeout=90)
     err = ended(listener, signal.SIGINT)
     stamps = [
@@ -172,14 +140,15 @@ def test_a_node_that_is_killed_and_restarted_is_heard_again(master: str, tmp_pat
 
 
 @needs_ros1
-def test_a_master_that_dies_costs_nothing_that_is_connected(master: str, tmp_path: Path) -> None:
+def test_a_master_that_dies_costs_nothing_that_is_connected(tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     names = ("--image", IMAGE, "--joints", STATES, "--patience", 3)
-    sender = robot(master, tmp_path, "jpeg", 64, 48, 30, 100, 4.0)
-    listener = recorder("ros1", out, "--master", master, *names)
-    wait_for(grown(out, 20_000), "a recording")
-    subprocess.run(["pkill", "-f", f"rosmaster --core -p {master.rpartition(':')[2]}"], check=True)
-    sent, _ = sender.communicate(timeout=90)
+    with ros1_master() as (master, process):
+        sender = robot(master, "jpeg", 64, 48, 30, 100, 4.0)
+        listener = recorder("ros1", out, "--master", master, *names)
+        wait_for(grown(out, 20_000), "a recording")
+        process.kill()
+        sent, _ = sender.communicate(timeout=90)
     err = ended(listener)
     assert len(by_topic(out)[IMAGE]) == int(sent.split()[0])
     assert err.count("who is connected is recorded on") == 1
@@ -187,7 +156,7 @@ def test_a_master_that_dies_costs_nothing_that_is_connected(master: str, tmp_pat
 
 @needs_ros1
 def test_list_shows_topics_types_and_rates(master: str, tmp_path: Path) -> None:
-    sender = robot(master, tmp_path, "jpeg", 64, 48, 20, 100, 4)
+    sender = robot(master, "jpeg", 64, 48, 20, 100, 4)
     command = ("record", "list", "--on", "ros1", "--master", master, "--json")
     done = tooltip(*command)
     for _ in range(10):  # until the robot is up

@@ -21,6 +21,7 @@ from tests.helpers.cli import tooltip
 from tests.helpers.live import free_port
 from tests.helpers.recorder import ROOT, by_topic, ended, grown, recorder, wait_for
 from tests.helpers.robot import URDF
+from tests.helpers.robots import Router
 from tests.helpers.ros2_robot import (
     IMAGE,
     INFO,
@@ -42,29 +43,6 @@ ANNOUNCED = (
     "@ros2_lv/7/1a2b/0/11/MP/%/%arm/driver/%arm%joint_states/"
     "sensor_msgs::msg::dds_::JointState_/RIHS01_ab/"
 )
-
-
-class Router:
-    """A router that can go away and come back under the same address."""
-
-    def __init__(self) -> None:
-        self.address = f"tcp/127.0.0.1:{free_port()}"
-        self.start()
-
-    def start(self) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "tests.helpers.zenoh_robot", self.address],
-            cwd=ROOT,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline() == "ready\n"
-
-    def stop(self) -> None:
-        self.process.kill()
-        self.process.communicate()
 
 
 @pytest.fixture
