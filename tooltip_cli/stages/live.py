@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tooltip_cli.errors import LowDiskError, TooltipError
 from tooltip_cli.log.crashsafe import MIN_FREE_BYTES, CrashSafeWriter, leftovers
-from tooltip_cli.log.messages import Message
+from tooltip_cli.log.messages import Message, header_stamp_ns
 from tooltip_cli.log.stopping import Stop
 from tooltip_cli.method.voting.watching import Verdict
 from tooltip_cli.sources.live import QUEUE_BYTES, Backlog, LiveSource, Receiver
@@ -27,6 +27,8 @@ _RATE_OVER_S = 2.0
 _SILENT_S = 1.0  # reported
 _RETRY_S = 1.0
 _JOIN_S = 2.0
+_STEP_NS = 500_000_000  # back in stamps: a clock that was set, not messages that overtook others
+_STEPS_TOLD = 3  # of a topic; two senders with clocks apart would be told without end
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,8 @@ class _Heard:
     since: float = field(default_factory=time.monotonic)  # last message, or the start
     silent: bool = False
     history: deque[tuple[float, int]] = field(default_factory=deque)
+    latest_ns: int = 0  # header stamp
+    steps: int = 0  # of the stamps, backwards
 
 
 def record_live(
@@ -219,8 +223,24 @@ class _Recorder:
         self._source.report.count(message.topic)
         if self._first_image is None and message.topic == self._source.image_topic:
             self._first_image = time.monotonic()
+        if message.topic in self._source.expected_topics:
+            self._follow_clock(message)
         if self._observer is not None:
             self._observer.take(message)
+
+    def _follow_clock(self, message: Message) -> None:
+        """Say where the stamps of a topic step back."""
+        heard, stamp_ns = self._heard[message.topic], header_stamp_ns(message.payload)
+        if stamp_ns is None:
+            return
+        back_ns = heard.latest_ns - stamp_ns
+        if back_ns > _STEP_NS and heard.steps < _STEPS_TOLD:
+            heard.steps += 1
+            self.note(
+                f"stamps on {message.topic} step back by {back_ns / 1e9:.1f} s: the sender's clock "
+                "was set, or it has started again"
+            )
+        heard.latest_ns = stamp_ns
 
     def _ended(self) -> bool:
         """Whether an end is reached; its reason is then in ``ends``, or was the user's own."""
