@@ -2,12 +2,13 @@
 
 The recorder's memory must stay flat within 5 %, and the log must hold what was sent.
 
-    python -m tests.soak.live [camera|ros2] [--minutes 30]
+    python -m tests.soak.live [camera|ros2|zenoh|ros1] [--minutes 30]
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import signal
@@ -18,15 +19,19 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from tests.helpers.live import free_port
 from tests.helpers.robot import RIG
+from tests.helpers.robots import TRANSPORTS, Network, network
+from tests.helpers.ros2_robot import IMAGE, STATES
 from tooltip_cli.log import messages
 from tooltip_cli.log.container import LoggedMessage, iterate
 from tooltip_cli.rig.rigfile import rig_files
 
-FPS, JOINT_HZ = "30", "100"
+PATHS = ("camera", *TRANSPORTS)
+FPS, JOINT_HZ = 30, 100
 ALLOWED = 0.05  # of the memory after the first tenth
 LOST_IMAGES = 0.002  # of those sent: what was on its way when the robot went
 _SESSION_S = 120.0
@@ -34,40 +39,44 @@ _AWAY_S = 3.0
 _EVERY_S = 1.0
 
 
-def commands(path: str, folder: Path) -> tuple[list[str], list[str]]:
-    """Return the recorder's arguments and the robot's, which lack the seconds."""
-    for name, text in rig_files(RIG).items():
-        (folder / name).write_text(text)
-    rig = ["--rig", str(folder / "rig.yaml")]
+@contextlib.contextmanager
+def joined(path: str) -> Iterator[tuple[Sequence[str], Callable[[float], subprocess.Popen[str]]]]:
+    """Provide the recorder's options, and what starts a robot for some seconds."""
     if path == "camera":
-        http, udp = free_port(), free_port(socket.SOCK_DGRAM)
-        record = ["--camera", f"http://127.0.0.1:{http}/", "--joints", f"udp://127.0.0.1:{udp}"]
-        return record + rig, ["tests.helpers.camera_robot", str(http), str(udp), FPS, JOINT_HZ]
-    domain = "78"
-    robot = ["tests.helpers.ros2_robot", domain, "jpeg", "640", "480", FPS, JOINT_HZ]
-    topics = ["--image", "/camera/image/compressed", "--joints", "/joint_states"]
-    return ["--domain", domain, *topics, *rig], robot
+        http, udp = str(free_port()), str(free_port(socket.SOCK_DGRAM))
+        robot = Network([], [sys.executable, "-m", "tests.helpers.camera_robot", http, udp])
+        options = ["--camera", f"http://127.0.0.1:{http}/", "--joints", f"udp://127.0.0.1:{udp}"]
+        yield options, lambda seconds: robot.start(FPS, JOINT_HZ, seconds)
+        return
+    with network(path, 78) as joined:
+        names = ["--image", IMAGE, "--joints", STATES]
+        yield (
+            [*joined.options, *names],
+            lambda seconds: joined.start("jpeg", 640, 480, FPS, JOINT_HZ, seconds),
+        )
 
 
 def main() -> None:
     """Print one line of JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("path", nargs="?", choices=("camera", "ros2"), default="camera")
+    parser.add_argument("path", nargs="?", choices=PATHS, default="camera")
     parser.add_argument("--minutes", type=float, default=30.0)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name:
+    with tempfile.TemporaryDirectory() as name, joined(options.path) as (chosen, start):
         folder = Path(name)
         out = folder / "out.mcap"
-        record, robot = commands(options.path, folder)
+        for file, text in rig_files(RIG).items():
+            (folder / file).write_text(text)
         command = [sys.executable, "-m", "tooltip_cli.cli.main", "record", options.path, str(out)]
-        recorder = subprocess.Popen([*command, *record, "--reconnect"], stderr=subprocess.PIPE)
+        command += [*chosen, "--rig", str(folder / "rig.yaml"), "--reconnect"]
+        recorder = subprocess.Popen(command, stderr=subprocess.PIPE)
         sent, memory = Counter[str](), list[int]()
         end = time.monotonic() + 60 * options.minutes
         while time.monotonic() < end:
             seconds = min(_SESSION_S, max(end - time.monotonic(), 1.0))
-            sent += session([sys.executable, "-m", *robot, str(seconds)], recorder.pid, memory)
+            sent += session(start(seconds), recorder.pid, memory)
             time.sleep(_AWAY_S)
-        recorder.send_signal(signal.SIGINT)
+        recorder.send_signal(signal.SIGTERM)  # SIGINT may be ignored, under nohup
         errors = recorder.stderr.read().decode() if recorder.stderr is not None else ""
         _, status, used = os.wait4(recorder.pid, 0)
         kept = Counter(item.datatype for item in iterate(out) if isinstance(item, LoggedMessage))
@@ -77,9 +86,8 @@ def main() -> None:
     assert "again after" in errors, errors
 
 
-def session(robot: list[str], recorder: int, memory: list[int]) -> Counter[str]:
+def session(process: subprocess.Popen[str], recorder: int, memory: list[int]) -> Counter[str]:
     """Let a robot send for its time; return how many images and joints it sent."""
-    process = subprocess.Popen(robot, stdout=subprocess.PIPE, text=True)
     while process.poll() is None:
         memory.append(private_bytes(recorder))
         time.sleep(_EVERY_S)
