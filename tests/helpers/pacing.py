@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 
@@ -26,3 +27,27 @@ def pace(
         if ahead > 0:
             time.sleep(ahead)
     return images, joints
+
+
+def play_file(path: str, senders: Callable[[str, str], Callable[[bytes], object]]) -> None:
+    """Send the messages of a file at their times.
+
+    Args:
+        path: for each message a line of JSON, with ``at_s``, ``topic``, ``type`` and ``bytes``, and
+            behind it so many bytes.
+        senders: returns what sends on a topic of a type; called for all of them before the first.
+    """
+    items: list[tuple[float, str, bytes]] = []
+    known: dict[str, Callable[[bytes], object]] = {}
+    with open(path, "rb") as file:  # noqa: PTH123 - also run by Pythons with nothing installed
+        while line := file.readline():
+            head = json.loads(line)
+            if head["topic"] not in known:
+                known[head["topic"]] = senders(head["topic"], head["type"])
+            items.append((head["at_s"], head["topic"], file.read(head["bytes"])))
+    time.sleep(5.0)  # until whoever listens has found all topics
+    start = time.monotonic()
+    for at_s, topic, data in items:
+        time.sleep(max(start + at_s - time.monotonic(), 0))
+        known[topic](data)
+    time.sleep(1.0)

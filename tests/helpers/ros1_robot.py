@@ -38,19 +38,42 @@ def angles(number: int) -> tuple[float, float]:
     return 0.001 * number, -0.5
 
 
-def pace() -> Any:
-    """Return tests.helpers.pacing.pace, without the packages that its neighbours need."""
+def pacing() -> Any:
+    """Return tests.helpers.pacing, without the packages that its neighbours need."""
     spec = importlib.util.spec_from_file_location("pacing", Path(__file__).with_name("pacing.py"))
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.pace
+    return module
+
+
+def play(path: str) -> None:
+    """Publish the messages of a file, which are ROS 1's; see tests.helpers.pacing."""
+    import rospy  # type: ignore[import-not-found]
+    import sensor_msgs.msg  # type: ignore[import-not-found]
+
+    rospy.init_node("robot", disable_signals=True)
+
+    def sender(name: str, datatype: str) -> Any:
+        made = getattr(sensor_msgs.msg, datatype.rsplit("/", 1)[1])
+        kind = type(made.__name__, (made,), {"serialize": lambda self, out: out.write(self.raw)})
+        publisher = rospy.Publisher(name, kind, queue_size=1000)
+
+        def send(data: bytes) -> None:
+            message = kind()
+            message.raw = data
+            publisher.publish(message)
+
+        return send
+
+    pacing().play_file(path, sender)
+    rospy.signal_shutdown("done")
 
 
 def main(kind: str, width: int, height: int, fps: float, hz: float, seconds: float) -> None:
-    import rospy  # type: ignore[import-not-found]
-    from sensor_msgs.msg import (  # type: ignore[import-not-found]
+    import rospy
+    from sensor_msgs.msg import (
         CameraInfo,
         CompressedImage,
         Image,
@@ -95,11 +118,14 @@ def main(kind: str, width: int, height: int, fps: float, hz: float, seconds: flo
             raise SystemExit("nobody listens")
         time.sleep(0.01)
     time.sleep(0.5)
-    print(*pace()(fps, hz, seconds, image, joint), flush=True)
+    print(*pacing().pace(fps, hz, seconds, image, joint), flush=True)
     time.sleep(1.0)
     rospy.signal_shutdown("done")
 
 
 if __name__ == "__main__":
-    kind, width, height, fps, hz, seconds = sys.argv[1:]
-    main(kind, int(width), int(height), float(fps), float(hz), float(seconds))
+    if sys.argv[1] == "play":
+        play(sys.argv[2])
+    else:
+        kind, width, height, fps, hz, seconds = sys.argv[1:]
+        main(kind, int(width), int(height), float(fps), float(hz), float(seconds))

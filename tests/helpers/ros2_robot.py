@@ -15,7 +15,7 @@ from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 
-from tests.helpers.pacing import pace
+from tests.helpers.pacing import pace, play_file
 from tests.helpers.robot import CAMERA, CAMERA_FRAME, JOINTS, URDF
 from tooltip_cli.log import messages
 from tooltip_cli.sources.dds import dds_type
@@ -95,6 +95,16 @@ def main(domain: int, kind: str, width: int, height: int, fps: float, hz: float,
     time.sleep(1.0)  # what is on its way still arrives
 
 
+def play(domain: int, path: str) -> None:
+    """Publish the messages of a file; see tests.helpers.pacing."""
+    participant = DomainParticipant(domain)
+    reliable = (Policy.Reliability.Reliable(10**9), Policy.History.KeepLast(100))
+    play_file(path, lambda name, kind: Publisher(participant, name, kind, *reliable).send)
+
+
 if __name__ == "__main__":
-    domain, kind, width, height, fps, hz, seconds = sys.argv[1:]
-    main(int(domain), kind, int(width), int(height), float(fps), float(hz), float(seconds))
+    if sys.argv[2] == "play":
+        play(int(sys.argv[1]), sys.argv[3])
+    else:
+        domain, kind, width, height, fps, hz, seconds = sys.argv[1:]
+        main(int(domain), kind, int(width), int(height), float(fps), float(hz), float(seconds))

@@ -17,7 +17,7 @@ from typing import Any
 import zenoh
 from zenoh.ext import CacheConfig, declare_advanced_publisher
 
-from tests.helpers.pacing import pace
+from tests.helpers.pacing import pace, play_file
 from tests.helpers.robot import CAMERA, CAMERA_FRAME, URDF
 from tests.helpers.ros2_robot import (
     IMAGE,
@@ -105,11 +105,19 @@ def main(router: str, kind: str, width: int, height: int, fps: float, hz: float,
     time.sleep(1.0)
 
 
+def play(router: str, path: str) -> None:
+    """Publish the messages of a file; see tests.helpers.pacing."""
+    peer = session("peer", connect=router)
+    play_file(path, lambda name, kind: Publisher(peer, name, kind).send)
+
+
 if __name__ == "__main__":
     if len(sys.argv) == 2:
         kept = session("router", listen=sys.argv[1])
         print("ready", flush=True)
         sys.stdin.read()  # until the test closes it
+    elif sys.argv[2] == "play":
+        play(sys.argv[1], sys.argv[3])
     else:
         where, kind, width, height, fps, hz, seconds = sys.argv[1:]
         main(where, kind, int(width), int(height), float(fps), float(hz), float(seconds))
