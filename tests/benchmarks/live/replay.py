@@ -3,14 +3,15 @@
 python -m tests.benchmarks.live.replay http|udp|ros2|zenoh|ros1 ../shared/data/reference/pen.mcap
 
 ``http`` and ``udp`` go to ``record camera``, as MJPEG and as an MPEG-TS stream of ffmpeg (needed),
-with joints over a socket; the others to the command of their name. A stream that is
-encoded and decoded is late by some images, so for ``udp`` the estimates find the clocks' offset.
+with joints over a socket; the others to the command of their name. A stream that is encoded and
+decoded is late by some images, so for ``udp`` the delay is measured and entered in the rig.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import re
 import resource
 import shutil
 import socket
@@ -25,14 +26,17 @@ from pathlib import Path
 import numpy as np
 
 from tests.helpers.live import MjpegServer, Played, free_port, play, played, udp_joints
+from tests.helpers.recorder import by_topic
 from tests.helpers.robots import Network, network
 from tooltip_cli.log import messages
 from tooltip_cli.log.container import LoggedMessage, iterate
 from tooltip_cli.log.recording import read_recording
 from tooltip_cli.rig.rigfile import load_rig, rig_files
 from tooltip_cli.sources.ros1types import typestore
+from tooltip_cli.sources.streams import IMAGE_TOPIC
 
 FPS = 30
+_LAST = 30  # images that the sender pushes out at its end
 
 
 def tooltip(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -40,9 +44,9 @@ def tooltip(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def tip(recording: Path, rig: Path, out: Path, *options: str) -> dict[str, object]:
+def tip(recording: Path, rig: Path, out: Path) -> dict[str, object]:
     out.mkdir()
-    done = tooltip("estimate", recording, "--rig", rig, "--out", out, "--json", *options)
+    done = tooltip("estimate", recording, "--rig", rig, "--out", out, "--json")
     print(done.stderr.strip())
     document: dict[str, object] = json.loads((out / f"{recording.stem}.tip.json").read_text())
     return document
@@ -60,10 +64,18 @@ def over_camera(kind: str, path: Path, rig: Path, out: Path) -> str:
     with sink() as (source, ready, show), udp_joints(port) as send:
         names = ["--camera", source, "--joints", f"udp://127.0.0.1:{port}", "--rig", rig]
         process = recorder("camera", out, *names, "--patience", 5)
-        items = played(path)
+        items, shown_ns = played(path), list[int]()
         ready(items, out)
-        play(items, show, send)
-    return process.communicate(timeout=60)[0]
+
+        def note_and_show(image: bytes) -> None:
+            shown_ns.append(time.time_ns())
+            show(image)
+
+        play(items, note_and_show, send)
+    said = process.communicate(timeout=60)[0]
+    if kind == "udp":
+        put_clocks_right(out, rig, shown_ns)
+    return said
 
 
 Camera = tuple[str, Callable[[Sequence[Played], Path], object], Callable[[bytes], object]]
@@ -152,15 +164,24 @@ def main(kind: str, path: Path) -> None:
     print(f"playing and recording took {used.ru_utime + used.ru_stime:.1f} s of processor time")
     # away from its labels, whose frames an estimate leaves out
     copy = Path(shutil.copy(path, folder / "own.mcap"))
-    options = ("--refine", "time") if kind == "udp" else ()
-    live = tip(out, full_rig, folder / "live", *options)
-    own = tip(copy, full_rig, folder / "own", *options)
+    live, own = tip(out, full_rig, folder / "live"), tip(copy, rig, folder / "own")
     print("live", live["status"], live.get("tip"), "\nown ", own["status"], own.get("tip"))
     if live["status"] == own["status"] == "ok":
         points = [np.array(item["tip"]["position_m"]) for item in (live, own)]  # type: ignore[index]
         apart = 1000 * np.linalg.norm(points[0] - points[1])
         print(f"{path.name} over {kind}: {apart:.2f} mm apart")
     shutil.rmtree(folder)
+
+
+def put_clocks_right(recording: Path, rig: Path, shown_ns: Sequence[int]) -> None:
+    """Enter in the rig how late the images came, as one would who has measured a camera's delay."""
+    stamps = [m.log_time_ns for m in by_topic(recording)[IMAGE_TOPIC]]
+    # counted from the end: what came before the play began has no partner
+    pairs = list(zip(reversed(stamps), reversed(shown_ns), strict=False))[_LAST:]
+    late_s = float(np.median([arrived - shown for arrived, shown in pairs])) / 1e9
+    print(f"{len(stamps)} images, {len(shown_ns)} shown, {1000 * late_s:.0f} ms late")
+    text = rig.read_text()
+    rig.write_text(re.sub(r"(?m)^time_offset:.*$", f"time_offset: {-late_s}", text))
 
 
 def with_camera(recording: Path, rig: Path, out: Path) -> None:
