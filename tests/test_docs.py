@@ -26,7 +26,7 @@ from tests.test_source_lerobot import write_v2
 from tests.test_source_video import JOINTS, write_video
 from tooltip_cli.cli.main import main
 from tooltip_cli.labels.files import COLUMNS, STATES, read_labels
-from tooltip_cli.log.messages import MOVING_EDGES, TIP_DETECTION, definition
+from tooltip_cli.log.messages import MOVING_EDGES, SILHOUETTE, TIP_DETECTION, definition
 from tooltip_cli.method import detector
 from tooltip_cli.method.evaluation import split_frames
 from tooltip_cli.method.voting.params import MovingParams, PairingParams, TrustParams
@@ -259,7 +259,8 @@ def test_named_targets_of_make_exist(page: Path) -> None:
 
 def test_message_definitions_are_shown_as_they_are() -> None:
     shown = blocks(DOCS / "file-formats.md", "text")
-    assert shown == [definition(TIP_DETECTION), definition(MOVING_EDGES)]
+    types = (TIP_DETECTION, MOVING_EDGES, SILHOUETTE)
+    assert shown == [definition(datatype) for datatype in types]
 
 
 def test_flags_and_codes_are_explained() -> None:

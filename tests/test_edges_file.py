@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -12,10 +14,11 @@ import pytest
 from tests.helpers import refusal
 from tooltip_cli.log import messages
 from tooltip_cli.log.detections import read_provenance
-from tooltip_cli.log.edges import TOPIC, read_edges, write_edges
-from tooltip_cli.log.messages import MOVING_EDGES, Message
+from tooltip_cli.log.edges import SILHOUETTE_TOPIC, TOPIC, read_edges, write_edges
+from tooltip_cli.log.messages import MOVING_EDGES, SILHOUETTE, Message
 from tooltip_cli.log.writer import LogWriter
 from tooltip_cli.method.voting.moving import MovingEdges
+from tooltip_cli.method.voting.silhouette import BACKGROUND, FOREGROUND, UNKNOWN, Silhouettes
 
 STAMPS = 1_700_000_000_123_456_789 + 33_333_333 * np.arange(40, dtype=np.int64)
 FIELDS = ("frames", "partners", "affines", "counts", "pixels", "translations", "covariances")
@@ -42,13 +45,25 @@ def some_edges(counts: tuple[int, ...] = (5, 0, 300)) -> MovingEdges:
     )
 
 
+def some_silhouettes(count: int = 3) -> Silhouettes:
+    rng = np.random.default_rng(9)
+    values = np.array([UNKNOWN, BACKGROUND, FOREGROUND], np.uint8)
+    counts = np.arange(count)[::-1] * 40
+    return Silhouettes(
+        rng.choice(values, (count, 24, 33)),
+        3,
+        counts,
+        rng.uniform(-1, 99, (int(counts.sum()), 2)).astype(np.float32),
+    )
+
+
 def written(path: Path, edges: MovingEdges | None = None) -> Path:
     write_edges(path, edges or some_edges(), STAMPS, "camera", {"key": "k", "version": "v"})
     return path
 
 
-def spoilt(path: Path, **changes: Any) -> Path:
-    """Write one frame of two edges, with some fields of the message changed."""
+def spoilt(path: Path, silhouette: dict[str, Any] | None = None, **changes: Any) -> Path:
+    """Write one frame of two edges, with some fields of the messages changed."""
     fields = {
         "header": messages.header(int(STAMPS[4]), "camera"),
         "partners": [messages.time_from_ns(int(STAMPS[i])) for i in (1, 6)],
@@ -61,6 +76,12 @@ def spoilt(path: Path, **changes: Any) -> Path:
     with LogWriter(path) as writer:
         payload = messages.encode(MOVING_EDGES, fields)
         writer.write(Message(TOPIC, MOVING_EDGES, int(STAMPS[4]), payload))
+        if silhouette is not None:
+            mask = bytes(cv2.imencode(".png", np.full((4, 6), FOREGROUND, np.uint8))[1])
+            fields = {"scale": 1, "mask": mask, "count": 2, "contour": bytes(16), **silhouette}
+            fields["header"] = messages.header(int(STAMPS[4]), "camera")
+            payload = messages.encode(SILHOUETTE, fields)
+            writer.write(Message(SILHOUETTE_TOPIC, SILHOUETTE, int(STAMPS[4]), payload))
     return path
 
 
@@ -79,6 +100,37 @@ def test_what_is_written_is_read(tmp_path: Path, counts: tuple[int, ...]) -> Non
         first, second = getattr(edges, name), getattr(back, name)
         assert second.dtype == first.dtype, name
         np.testing.assert_array_equal(second, first, name)
+
+
+@pytest.mark.parametrize("count", [3, 1])
+def test_silhouettes_are_read_as_they_were(tmp_path: Path, count: int) -> None:
+    silhouettes = some_silhouettes(count)
+    edges = replace(some_edges((5, 0, 300)[:count]), silhouettes=silhouettes)
+    back = read_edges(written(tmp_path / "a.edges.mcap", edges), STAMPS).silhouettes
+    assert back is not None
+    assert back.scale == silhouettes.scale
+    for name in ("masks", "counts", "contours"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(silhouettes, name), name)
+
+
+def test_edges_of_some_frames_have_their_silhouettes() -> None:
+    edges = replace(some_edges(), silhouettes=some_silhouettes())
+    part = edges.of_frames(edges.frames[[0, 2]])
+    assert part.counts.tolist() == [5, 300]
+    np.testing.assert_array_equal(part.pixels, edges.pixels)  # the frame between has none
+    assert part.silhouettes is not None
+    assert part.silhouettes.counts.tolist() == [80, 0]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"scale": 0}, {"mask": b""}, {"mask": b"no image"}, {"count": 3}, {"contour": bytes(15)}],
+)
+def test_another_layout_of_silhouettes_is_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
+    good = read_edges(spoilt(tmp_path / "good.edges.mcap", {}), STAMPS).silhouettes
+    assert good is not None
+    assert (good.masks == FOREGROUND).all()
+    assert "silhouettes in a layout" in refused(spoilt(tmp_path / "a.edges.mcap", changes))
 
 
 def test_frames_are_found_by_their_stamps(tmp_path: Path) -> None:

@@ -385,3 +385,18 @@ def test_damaged_urdf_is_read_or_refused(cut: int, insert: str) -> None:
         lambda: KinematicChain.from_urdf(text, CAMERA_FRAME, HAND_FRAME, None, "arm.urdf")
     )
     assert message is None or message.startswith("arm.urdf")
+
+
+def test_the_camera_is_seen_from_the_root_too() -> None:
+    joints = [Joint("neck", "revolute", "base", "head", (0.0, 0.1, 0.4), axis=(0, 1, 0)), *ARM[:4]]
+    chain = KinematicChain.from_urdf(urdf_of(joints), "head", "hand", None, "test")
+    values = {"lift": 0.1, "turn": 0.2, "bend": 0.3}
+    rows = [[{**values, "neck": neck}[name] for name in chain.joint_names] for neck in (0.0, 0.3)]
+    from_hand, from_root = chain.camera_poses([*rows, [np.nan] * 4])
+    assert np.isnan(from_root[2]).all()
+    for row, neck in enumerate((0.0, 0.3)):
+        there = expected("head", "base", joints, {**values, "neck": neck})
+        assert np.abs(from_root[row] - there).max() < 1e-12
+    # the hand stays where it is, seen from the root
+    hands = from_root[:2] @ np.linalg.inv(from_hand[:2])
+    assert np.abs(hands[0] - hands[1]).max() < 1e-12

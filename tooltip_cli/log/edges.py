@@ -1,4 +1,4 @@
-"""``STEM.edges.mcap``: the moving edges of frames paired by the hand's motion."""
+"""``STEM.edges.mcap``: moving edges and silhouettes of frames paired by the hand's motion."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from tooltip_cli.errors import TooltipError
 from tooltip_cli.log import messages
 from tooltip_cli.log.container import LoggedAttachment, iterate
 from tooltip_cli.log.detections import PROVENANCE
-from tooltip_cli.log.messages import MOVING_EDGES, Message
+from tooltip_cli.log.messages import MOVING_EDGES, SILHOUETTE, Message
 from tooltip_cli.log.writer import LogWriter
 from tooltip_cli.method.voting.moving import FrameEdges, MovingEdges, join
+from tooltip_cli.method.voting.silhouette import FrameSilhouette
 
 TOPIC = "/tooltip/moving_edges"
+SILHOUETTE_TOPIC = "/tooltip/silhouettes"
 
 _EDGE = np.dtype(
     [("pixel", "<u2", 2), ("translation", "i1", (2, 2)), ("covariance", "<f4", (2, 3))]
 )
+_POINT_BYTES = 8
 
 
 def write_edges(
@@ -32,7 +35,7 @@ def write_edges(
     frame_id: str,
     provenance: Mapping[str, Any],
 ) -> None:
-    """Write moving edges whole or not at all, replacing an older file.
+    """Write moving edges and silhouettes whole or not at all, replacing an older file.
 
     Args:
         stamps_ns: (N,) image stamps of the recording.
@@ -46,6 +49,8 @@ def write_edges(
     packed["translation"] = edges.translations
     packed["covariance"] = edges.covariances
     stops = np.cumsum(edges.counts)
+    silhouettes = edges.silhouettes
+    corners = np.cumsum(silhouettes.counts) if silhouettes is not None else stops
     with LogWriter(path, overwrite=True) as writer:
         for row, stop in enumerate(stops):
             stamp_ns = int(stamps_ns[edges.frames[row]])
@@ -61,11 +66,28 @@ def write_edges(
             writer.write(
                 Message(TOPIC, MOVING_EDGES, stamp_ns, messages.encode(MOVING_EDGES, fields))
             )
+            if silhouettes is not None:
+                points = slice(corners[row] - silhouettes.counts[row], corners[row])
+                fields = {
+                    "header": messages.header(stamp_ns, frame_id),
+                    "scale": silhouettes.scale,
+                    "mask": _png(silhouettes.masks[row]),
+                    "count": int(silhouettes.counts[row]),
+                    "contour": silhouettes.contours[points].astype("<f4").tobytes(),
+                }
+                payload = messages.encode(SILHOUETTE, fields)
+                writer.write(Message(SILHOUETTE_TOPIC, SILHOUETTE, stamp_ns, payload))
         writer.attach(PROVENANCE, "application/json", json.dumps(provenance, indent=1).encode())
 
 
+def _png(mask: npt.NDArray[np.uint8]) -> bytes:
+    import cv2
+
+    return bytes(cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
+
+
 def read_edges(path: Path, stamps_ns: npt.NDArray[np.int64]) -> MovingEdges:
-    """Read moving edges back, frames found by their stamps.
+    """Read moving edges and silhouettes back, frames found by their stamps.
 
     Args:
         stamps_ns: (N,) image stamps of the recording they belong to.
@@ -73,11 +95,16 @@ def read_edges(path: Path, stamps_ns: npt.NDArray[np.int64]) -> MovingEdges:
     Raises:
         TooltipError: unreadable, malformed, or of another recording.
     """
-    rows = [
-        messages.decode_foreign(MOVING_EDGES, item.payload, str(path))
-        for item in iterate(path)
-        if not isinstance(item, LoggedAttachment) and item.topic == TOPIC
-    ]
+    rows: list[Any] = []
+    shown: dict[int, FrameSilhouette] = {}
+    for item in iterate(path):
+        if isinstance(item, LoggedAttachment):
+            continue
+        if item.topic == TOPIC:
+            rows.append(messages.decode_foreign(MOVING_EDGES, item.payload, str(path)))
+        elif item.topic == SILHOUETTE_TOPIC:
+            row = messages.decode_foreign(SILHOUETTE, item.payload, str(path))
+            shown[messages.ns_from_time(row.header.stamp)] = _silhouette(row, path)
     stamps = np.array(
         [
             [messages.ns_from_time(row.header.stamp), *map(messages.ns_from_time, row.partners)]
@@ -89,12 +116,28 @@ def read_edges(path: Path, stamps_ns: npt.NDArray[np.int64]) -> MovingEdges:
         raise TooltipError(f"{path} holds moving edges of another recording")
     index = np.searchsorted(stamps_ns, stamps)
     parts = []
-    for row in rows:
+    for row, stamp_ns in zip(rows, stamps[:, 0], strict=True):
         if row.edge_step != _EDGE.itemsize or len(row.data) != row.count * _EDGE.itemsize:
             raise TooltipError(f"{path} holds moving edges in a layout that is not read")
         packed = np.frombuffer(row.data, dtype=_EDGE)
-        affines = np.array(row.affines, dtype=float).reshape(2, 2, 3)
         parts.append(
-            FrameEdges(affines, packed["pixel"], packed["translation"], packed["covariance"])
+            FrameEdges(
+                np.array(row.affines, dtype=float).reshape(2, 2, 3),
+                packed["pixel"],
+                packed["translation"],
+                packed["covariance"],
+                shown.get(int(stamp_ns)),
+            )
         )
     return join(index[:, 0], index[:, 1:], parts)
+
+
+def _silhouette(row: Any, path: Path) -> FrameSilhouette:
+    import cv2
+
+    data = np.frombuffer(bytes(row.mask), dtype=np.uint8)
+    mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
+    if mask is None or row.scale < 1 or len(row.contour) != _POINT_BYTES * row.count:
+        raise TooltipError(f"{path} holds silhouettes in a layout that is not read")
+    contour = np.frombuffer(row.contour, dtype="<f4").astype(np.float32).reshape(-1, 2)
+    return FrameSilhouette(np.asarray(mask, dtype=np.uint8), int(row.scale), contour)

@@ -31,6 +31,7 @@ SCENE_UPDATE = "foxglove_msgs/msg/SceneUpdate"
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 TIP_DETECTION = "tooltip_msgs/msg/TipDetection"
 MOVING_EDGES = "tooltip_msgs/msg/MovingEdges"
+SILHOUETTE = "tooltip_msgs/msg/Silhouette"
 
 _PRIMITIVE = re.compile(r"^(bool|byte|char|w?string|float(32|64)|u?int(8|16|32|64))\b")
 _SEPARATOR = "=" * 80

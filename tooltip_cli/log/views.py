@@ -39,6 +39,8 @@ class Views:
     stamps_ns: Stamps  # (N,) image stamps as logged
     hand_from_camera: Array  # (N, 4, 4), T_c of the paper; NaN where the hand's pose is unknown
     spheres: tuple[Sphere, ...]  # the hand and wrist, hand frame, metres
+    root_from_camera: Array  # (N, 3, 3) how the camera is turned; joints that camera and hand hang
+    # on together count as still
 
     @property
     def known(self) -> npt.NDArray[np.bool_]:
@@ -107,9 +109,13 @@ def resolve_views(recording: Recording, rig: Rig) -> Views:
     pose_topic = recording.pose_topic or rig.pose_topic
     if pose_topic is not None:
         transforms = _from_poses(recording, rig, pose_topic, query)
+        turned = np.tile(
+            np.eye(3), (len(query), 1, 1)
+        )  # the mount's parent is where poses are from
     else:
-        transforms = _from_joints(recording, rig, query)
-    return Views(camera, recording.image_stamps_ns, transforms, rig.spheres)
+        transforms, root_from_camera = _from_joints(recording, rig, query)
+        turned = root_from_camera[:, :3, :3]
+    return Views(camera, recording.image_stamps_ns, transforms, rig.spheres, turned)
 
 
 def corrected_rig(
@@ -142,7 +148,7 @@ def _check_image_size(recording: Recording, camera: CameraModel) -> None:
         )
 
 
-def _from_joints(recording: Recording, rig: Rig, query_ns: Stamps) -> Array:
+def _from_joints(recording: Recording, rig: Rig, query_ns: Stamps) -> tuple[Array, Array]:
     chain = resolve_chain(recording, rig)
     if not recording.joints:
         raise TooltipError(
@@ -161,7 +167,7 @@ def _from_joints(recording: Recording, rig: Rig, query_ns: Stamps) -> Array:
         interpolate(track.stamps_ns, track.positions, query_ns, MAX_GAP_NS)
         for track in needed.values()
     ]
-    return chain.hand_from_camera(np.stack(positions, axis=1))
+    return chain.camera_poses(np.stack(positions, axis=1))
 
 
 def urdf_tracks(recording: Recording, rig: Rig) -> dict[str, JointTrack]:

@@ -7,10 +7,11 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from numba import float32, float64, int32, int64, void
+from numba import float32, float64, int32, int64, uint8, void
 
 from tooltip_cli.method._jit import compiled
 
+_BACKGROUND, _FOREGROUND = 127, 255  # values of a mask, as in silhouette.py
 _NEAR = 0.02  # metres; nothing closer to the optical centre is seen
 
 
@@ -164,6 +165,79 @@ def _place(
                 scores[e], ratios[e] = score, ratio
 
 
+def _carve(voxels: Any, cameras: Any, masks: Any, limit: int, inside: Any, carved: Any) -> None:
+    """Count, for each voxel, the masks in which it is foreground and background.
+
+    Stops at voxels that are background in more than ``limit`` masks.
+    """
+    height, width = masks.shape[1], masks.shape[2]
+    for i in range(len(voxels)):
+        x, y, z = voxels[i, 0], voxels[i, 1], voxels[i, 2]
+        for f in range(len(cameras)):
+            m = cameras[f]
+            depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+            if depth < _NEAR:
+                continue
+            u = math.floor((m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth + 0.5)
+            v = math.floor((m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth + 0.5)
+            if u < 0 or v < 0 or u >= width or v >= height:
+                continue
+            value = masks[f, v, u]
+            if value == _FOREGROUND:
+                inside[i] += 1
+            elif value == _BACKGROUND:
+                carved[i] += 1
+                if carved[i] > limit:
+                    break
+
+
+def _on_tool(
+    pixels: Any,
+    rows: Any,
+    profiles: Any,
+    first: Any,
+    step: Any,
+    at: Any,
+    direction: Any,
+    scale: Any,
+    sine: Any,
+    depth: Any,
+    axis_depth: Any,
+    width: float,
+    reach: float,
+    beyond: float,
+    min_sine: float,
+    min_ratio: float,
+    kept: Any,
+    along: Any,
+    across: Any,
+    lengthwise: Any,
+) -> int:
+    """Choose the edges about an end whose motion fits its depth, and place them by its axis."""
+    samples = profiles.shape[1]
+    count = 0
+    for e in range(len(rows)):
+        row = rows[e]
+        if sine[row] <= min_sine:
+            continue
+        du, dv = pixels[e, 0] - at[row, 0], pixels[e, 1] - at[row, 1]
+        forward = (du * direction[row, 0] + dv * direction[row, 1]) / scale[row]
+        if forward >= beyond or forward <= -reach:
+            continue
+        aside = (dv * direction[row, 0] - du * direction[row, 1]) / scale[row]
+        if abs(aside) >= width:
+            continue
+        length = forward / sine[row]
+        if samples > 0:
+            z = depth[row] + min(length, 0.0) * axis_depth[row]
+            sample = math.floor((z - first[e]) / step[e] + 0.5)
+            if profiles[e, min(max(sample, 0), samples - 1)] <= min_ratio:
+                continue
+        kept[count], along[count], across[count], lengthwise[count] = row, forward, aside, length
+        count += 1
+    return count
+
+
 @functools.cache
 def profile_kernel() -> Callable[..., None]:
     """Return the compiled depth profiles."""
@@ -200,6 +274,26 @@ def vote_kernel() -> Callable[..., None]:
         float32[:, :, ::1],
     )
     return compiled(_vote, signature)
+
+
+@functools.cache
+def on_tool_kernel() -> Callable[..., int]:
+    """Return the compiled choice of edges about an end."""
+    plane, line = float64[:, ::1], float64[::1]
+    signature = int64(
+        plane, int64[::1], float32[:, ::1], line, line, plane, plane, *[line] * 4,
+        *[float64] * 5, int64[::1], line, line, line,
+    )  # fmt: skip
+    return compiled(_on_tool, signature)
+
+
+@functools.cache
+def carve_kernel() -> Callable[..., None]:
+    """Return the compiled carving."""
+    signature = void(
+        float64[:, ::1], float64[:, :, ::1], uint8[:, :, ::1], int64, int32[::1], int32[::1]
+    )
+    return compiled(_carve, signature)
 
 
 @functools.cache

@@ -184,12 +184,24 @@ class KinematicChain:
         Returns:
             (N, 4, 4); NaN where a position is not finite.
         """
+        return self.camera_poses(positions)[0]
+
+    def camera_poses(self, positions: npt.ArrayLike) -> tuple[Array, Array]:
+        """Return where the camera is, seen from the hand and from the robot's root.
+
+        Args:
+            positions: (N, J) joint positions in the order of ``joint_names``, rad or m.
+
+        Returns:
+            hand_from_camera and root_from_camera, (N, 4, 4); NaN where a position is not finite.
+            Joints that camera and hand hang on together count as still.
+        """
         import pinocchio
 
         positions = np.asarray(positions, dtype=float).reshape(-1, len(self.joint_names))
         data = self._model.createData()
         q = pinocchio.neutral(self._model)
-        transforms = np.full((len(positions), 4, 4), np.nan)
+        from_hand, from_root = np.full((2, len(positions), 4, 4), np.nan)
         for row, configuration in enumerate(positions):
             if not np.isfinite(configuration).all():
                 continue
@@ -201,8 +213,9 @@ class KinematicChain:
             pinocchio.forwardKinematics(self._model, data, q)
             camera = pinocchio.updateFramePlacement(self._model, data, self._camera_frame_id)
             hand = pinocchio.updateFramePlacement(self._model, data, self._hand_frame_id)
-            transforms[row] = hand.actInv(camera).homogeneous
-        return transforms @ self._frame_from_camera
+            from_hand[row] = hand.actInv(camera).homogeneous
+            from_root[row] = camera.homogeneous
+        return from_hand @ self._frame_from_camera, from_root @ self._frame_from_camera
 
 
 def build_model(pinocchio: Any, urdf: str, source: str) -> Any:

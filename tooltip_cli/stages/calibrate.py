@@ -17,10 +17,10 @@ from tooltip_cli.method.rays import sphere_array
 from tooltip_cli.method.types import Array, Correction, Refinement
 from tooltip_cli.method.voting.calibrate import PosesAt, Seen
 from tooltip_cli.method.voting.calibrate import calibrate as solve
-from tooltip_cli.method.voting.estimate import check_motion, first_end
+from tooltip_cli.method.voting.ends import first_end
+from tooltip_cli.method.voting.estimate import check_motion
 from tooltip_cli.method.voting.pairing import Pairing
 from tooltip_cli.method.voting.params import VotingSettings
-from tooltip_cli.method.voting.sight import near_edges
 from tooltip_cli.method.voting.volume import HandEdges
 from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.rig.rigfile import Rig, rig_files
@@ -84,7 +84,7 @@ def calibrate(
         end = None
         if reason is None:
             detected = detect_edges_in(
-                recording, views, pairing, settings.moving, out=out, jobs=jobs, on_frame=on_frame
+                recording, views, pairing, settings, out=out, jobs=jobs, on_frame=on_frame
             )
             spheres = sphere_array([(sphere.center, sphere.radius) for sphere in views.spheres])
             edges = hand_edges(views, detected.edges, poses, settings)
@@ -137,13 +137,10 @@ def seen_end(
     settings: VotingSettings,
 ) -> Seen | None:
     """Return the first end of a recording's tool with the poses at shifted stamps; None: none."""
-    found = first_end(edges, spheres, settings)
-    if found is None:
+    end = first_end(edges, spheres, settings)
+    if end is None:
         return None
-    cloud, end = found
-    near = near_edges(edges, cloud, end.position, settings.refine)
-    poses_at = _poses_at(recording, rig, pairing)
-    return Seen(near, poses_at, end.position, end.axis, end.radius)
+    return Seen(end.near, _poses_at(recording, rig, pairing), end.position, end.axis, end.radius)
 
 
 def _poses_at(recording: Recording, rig: Rig, pairing: Pairing) -> PosesAt:

@@ -130,7 +130,7 @@ def export_cloud(
     if reason is not None:
         raise RefusedError(f"{result.recording.path} shows no shape: {reason.text}")
     detected = detect_edges_in(
-        result.recording, result.views, pairing, settings.moving, out=out, jobs=jobs
+        result.recording, result.views, pairing, settings, out=out, jobs=jobs
     )
     cloud = reconstruct(hand_edges(result.views, detected.edges, poses, settings), settings.voting)
     points, frames = agreed_points(cloud.points, cloud.frames, _CLOUD_VOXEL, _CLOUD_FRAMES)

@@ -20,7 +20,6 @@ from tooltip_cli.method.rays import sphere_array
 from tooltip_cli.method.types import Array, Indices, TipEstimate
 from tooltip_cli.method.voting.estimate import METHOD as VOTING
 from tooltip_cli.method.voting.estimate import estimate_by_voting
-from tooltip_cli.method.voting.moving import MovingEdges
 from tooltip_cli.report.model import (
     ErrorShares,
     EstimateScore,
@@ -275,31 +274,14 @@ def _votes(case: Case) -> tuple[Indices, EstimateOn]:
     pairing, camera_from_hand = pair_views(views, settings, allowed)
     if case.found["detections"].estimate.position is None:
         return pairing.frames[:0], lambda frames: case.found["detections"].estimate
-    edges = detect_edges_in(
-        case.recording, views, pairing, settings.moving, out=case.detected_out
-    ).edges
+    edges = detect_edges_in(case.recording, views, pairing, settings, out=case.detected_out).edges
     spheres = sphere_array([(item.center, item.radius) for item in views.spheres])
 
     def estimate_on(frames: Indices) -> TipEstimate:
-        chosen = hand_edges(views, _of_frames(edges, frames), camera_from_hand, settings)
+        chosen = hand_edges(views, edges.of_frames(frames), camera_from_hand, settings)
         return estimate_by_voting(chosen, spheres, settings)
 
     return edges.frames, estimate_on
-
-
-def _of_frames(edges: MovingEdges, frames: Indices) -> MovingEdges:
-    """Return the edges of some of the frames."""
-    kept = np.isin(edges.frames, frames)
-    edge = kept[edges.frame_of_edge]
-    return MovingEdges(
-        edges.frames[kept],
-        edges.partners[kept],
-        edges.affines[kept],
-        edges.counts[kept],
-        edges.pixels[edge],
-        edges.translations[edge],
-        edges.covariances[edge],
-    )
 
 
 def _training_point(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ from tooltip_cli.method.voting.moving import (
     smooth,
 )
 from tooltip_cli.method.voting.pairing import Pairing
-from tooltip_cli.method.voting.params import MovingParams
+from tooltip_cli.method.voting.params import MovingParams, VotingSettings
 from tooltip_cli.rig.camera import CameraModel
 from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.stages.artifacts import (
@@ -37,10 +37,11 @@ from tooltip_cli.stages.artifacts import (
     stage_key,
 )
 from tooltip_cli.stages.clock import laps
+from tooltip_cli.stages.scene import Scene
 from tooltip_cli.stages.threads import in_order
 
 SUFFIX = ".edges.mcap"
-VERSION = 1
+VERSION = 2
 _FRAMES_A_TASK = 16
 _NOISE_PAIRS = 8
 _LOGGER = logging.getLogger(__name__)
@@ -60,16 +61,17 @@ def detect_edges_in(
     recording: Recording,
     views: Views,
     pairing: Pairing,
-    params: MovingParams,
+    settings: VotingSettings,
     *,
     out: Path | None = None,
     force: bool = False,
     jobs: int = 1,
     on_frame: Callable[[], None] = lambda: None,
 ) -> DetectedEdges:
-    """Find the moving edges of all chosen frames and write ``STEM.edges.mcap``, or reuse it.
+    """Find what moves or stands before the background in all chosen frames.
 
-    It depends on the rig through the pairing and through where the hand is in the images.
+    Writes ``STEM.edges.mcap``, or reuses it. It depends on the rig through the pairing, through
+    where the hand is in the images, and through how the camera turns.
 
     Args:
         jobs: threads; the result does not depend on them.
@@ -78,7 +80,8 @@ def detect_edges_in(
     Raises:
         TooltipError: an image cannot be decoded, or the artifact not written.
     """
-    centres, radii = hand_in_image(views, pairing.frames, params.reach)
+    params = {"moving": settings.moving, "silhouette": settings.silhouette}
+    centres, radii = hand_in_image(views, pairing.frames, settings.moving.reach)
     parents = {
         "recording": recording.sha256,
         "image_topic": recording.image_topic,
@@ -86,6 +89,7 @@ def detect_edges_in(
         "partners": digest(pairing.partners),
         # to the pixel: what is looked at does not change with less
         "hand": digest(np.round(np.column_stack([centres, radii]))),
+        "turned": digest(np.round(views.root_from_camera[pairing.frames], 4)),
     }
     key = stage_key("edges", VERSION, parents, params)
     if not force:
@@ -93,7 +97,7 @@ def detect_edges_in(
             stored = _stored(place, key, recording)
             if stored is not None:
                 return DetectedEdges(place, key, True, stored)
-    edges = find_moving_edges(recording, views, pairing, params, jobs, on_frame)
+    edges = find_moving_edges(recording, views, pairing, settings, jobs, on_frame)
     lap = laps()
     path = artifact_path(recording.path, SUFFIX, out)
     ensure_directory(path.parent)
@@ -124,19 +128,26 @@ def find_moving_edges(
     recording: Recording,
     views: Views,
     pairing: Pairing,
-    params: MovingParams,
+    settings: VotingSettings,
     jobs: int,
     on_frame: Callable[[], None],
 ) -> MovingEdges:
-    """Find the moving edges of all chosen frames; the result does not depend on ``jobs``."""
+    """Find the edges and silhouettes of all chosen frames; they do not depend on ``jobs``."""
     lap = laps()
     noise = _noise(recording, pairing)
     lap("decode")
+    scene = Scene(recording, views, pairing.frames, settings.silhouette)
+    lap("background")
     parts: list[FrameEdges] = []
     starts = range(0, len(pairing.frames), _FRAMES_A_TASK)
 
     def work(start: int) -> list[FrameEdges]:
-        return _chunk(recording, views, pairing, noise, params, start)
+        edges = _chunk(recording, views, pairing, noise, settings.moving, start)
+        shown = scene.silhouettes(pairing.frames[start : start + _FRAMES_A_TASK])
+        return [
+            replace(part, silhouette=silhouette)
+            for part, silhouette in zip(edges, shown, strict=True)
+        ]
 
     for part in in_order(work, starts, jobs):
         parts.append(part)

@@ -16,6 +16,7 @@ from tooltip_cli.method.voting.estimate import METHOD, check_motion, estimate_by
 from tooltip_cli.method.voting.moving import MovingEdges
 from tooltip_cli.method.voting.pairing import Pairing, pair_frames
 from tooltip_cli.method.voting.params import VotingSettings
+from tooltip_cli.method.voting.silhouette import UNKNOWN, HandSilhouettes
 from tooltip_cli.method.voting.volume import HandEdges
 from tooltip_cli.rig.camera import CameraModel
 from tooltip_cli.rig.kinematics import inverse_transform
@@ -58,7 +59,7 @@ def vote(
     if reason is not None:
         return refused(METHOD, len(pairing.frames), reason), None
     detected = detect_edges_in(
-        recording, views, pairing, settings.moving, out=out, jobs=jobs, on_frame=on_frame
+        recording, views, pairing, settings, out=out, jobs=jobs, on_frame=on_frame
     )
     edges = hand_edges(views, detected.edges, camera_from_hand, settings)
     spheres = sphere_array([(sphere.center, sphere.radius) for sphere in views.spheres])
@@ -93,7 +94,7 @@ def detect_for_voting(
         recording,
         views,
         pairing,
-        settings.moving,
+        settings,
         out=out,
         force=force,
         jobs=jobs,
@@ -118,6 +119,45 @@ def hand_edges(
         _focal(camera),
         image_extent(camera),
         settings.moving.reach,
+        _hand_silhouettes(camera, moving, camera_from_hand),
+    )
+
+
+def _hand_silhouettes(
+    camera: CameraModel, moving: MovingEdges, camera_from_hand: Array
+) -> HandSilhouettes | None:
+    """Undo the lens distortion of silhouettes."""
+    found = moving.silhouettes
+    if found is None:
+        return None
+    view = np.diag([1 / found.scale, 1 / found.scale, 1.0]) @ camera.matrix
+    return HandSilhouettes(
+        camera_from_hand[moving.frames],
+        _undistorted(found.masks, view, found.scale, camera),
+        view,
+        _normalized(camera, found.contours.astype(float)),
+        found.row_of_point,
+        _focal(camera),
+    )
+
+
+def _undistorted(
+    masks: npt.NDArray[np.uint8], view: Array, scale: int, camera: CameraModel
+) -> npt.NDArray[np.uint8]:
+    """Return masks as a camera without distortion sees them."""
+    import cv2
+
+    if not any(camera.distortion):
+        return masks
+    height, width = masks.shape[1:]
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(view).T
+    at = np.nan_to_num(camera.project(rays) / scale, nan=-1e4).astype(np.float32)
+    return np.stack(
+        [
+            np.asarray(cv2.remap(mask, at, None, cv2.INTER_NEAREST, borderValue=UNKNOWN), np.uint8)
+            for mask in masks
+        ]
     )
 
 

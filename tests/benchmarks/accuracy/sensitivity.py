@@ -5,7 +5,7 @@ Example:
 
 Prints, for each parameter, the mean tip error of the nearest candidate over the recordings, and the
 worst, in millimetres; at the start that of the defaults. Recordings need the truth inside or beside
-them, as in run.py. Groups pairing and moving detect anew for each value, which takes longer.
+them, as in run.py. The groups pairing, moving and silhouette detect anew for each value.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from tooltip_cli.stages.moving import find_moving_edges
 from tooltip_cli.stages.voting import hand_edges, pair_views
 
 SKIPPED = {"seed"}
-DETECTED = {"pairing", "moving"}
+DETECTED = {"pairing", "moving", "silhouette"}
 
 
 def main() -> None:
@@ -73,16 +73,14 @@ class Case:
 
     def _edges(self, settings: VotingSettings) -> MovingEdges | None:
         usual = VotingSettings()
-        same = (settings.pairing, settings.moving) == (usual.pairing, usual.moving)
+        same = all(getattr(settings, group) == getattr(usual, group) for group in DETECTED)
         if same and self._default is not None:
             return self._default
         allowed = unlabelled(self.recording, self.views.camera, None)
         pairing, _ = pair_views(self.views, settings, allowed)
         if len(pairing.frames) < settings.trust.min_frames:
             return None
-        found = find_moving_edges(
-            self.recording, self.views, pairing, settings.moving, 2, lambda: None
-        )
+        found = find_moving_edges(self.recording, self.views, pairing, settings, 2, lambda: None)
         if same:
             self._default = found
         return found

@@ -22,6 +22,8 @@ from tooltip_cli.method.voting.volume import Cloud, agreed_points, count_frames
 _BIN = 0.001  # metres, of the density along the axis
 _BLURS = (1.5, 2.0, 2.5, 3.0)  # bins, standard deviations tried for how blurred the end is
 _NO_SCORE = np.inf
+_BESIDE = 27  # voxels about one, itself among them
+_SOLID_VOXELS = 2000  # of a solid, whose axis is looked for
 _MARGIN = 4  # voxels around the points, so that smoothing does not meet the box
 
 
@@ -78,13 +80,30 @@ def tool_shape(cloud: Cloud, spheres: Array, reach: float, params: EndParams) ->
     return Shape(voxels[kept], values[kept])
 
 
+def grip_of(spheres: Array) -> Array:
+    """Return (3,) the middle of the hand's spheres (S, 4), else the hand's origin."""
+    if not len(spheres):
+        return np.zeros(3)
+    return np.asarray(np.average(spheres[:, :3], axis=0, weights=spheres[:, 3] ** 3))
+
+
 def far_voxels(shape: Shape, params: EndParams) -> Indices:
     """Return voxels that are farthest from the wrist in their surroundings, farthest first."""
+    if not len(shape.voxels):
+        return np.zeros(0, dtype=np.intp)
+    from scipy.spatial import KDTree
+
     distances = np.linalg.norm(shape.voxels, axis=1)
+    order = np.argsort(-distances, kind="stable")
+    order = order[distances[order] >= params.other_end_share * distances.max()]
+    # most have a farther one right beside them, which is soon seen
+    beside = min(len(shape.voxels), _BESIDE)
+    _, neighbours = KDTree(shape.voxels).query(
+        shape.voxels[order], k=beside, distance_upper_bound=params.end_separation
+    )
+    beside_distances = np.append(distances, 0.0)[neighbours.reshape(len(order), beside)]
     ends: list[int] = []
-    for candidate in np.argsort(-distances, kind="stable"):
-        if distances[candidate] < params.other_end_share * distances.max():
-            break
+    for candidate in order[beside_distances.max(axis=1) <= distances[order]]:
         apart = np.linalg.norm(shape.voxels - shape.voxels[candidate], axis=1)
         near = apart < params.end_separation
         # voxels of one end may be equally far: the first stands for it
@@ -97,8 +116,7 @@ def locate_end(
     cloud: Cloud, shape: Shape, far: Array, spheres: Array, params: EndParams
 ) -> ToolEnd:
     """Find axis and middle of the end that ``far`` (3,), metres, lies on."""
-    grip = np.average(spheres[:, :3], axis=0, weights=spheres[:, 3] ** 3) if len(spheres) else 0.0
-    outwards = _unit(far - grip)
+    outwards = _unit(far - grip_of(spheres))
     near = shape.voxels[np.linalg.norm(shape.voxels - far, axis=1) < params.neighbourhood] - far
     axis = _slender_axis(near, _cone(outwards, params.cone_deg), outwards, params)
     axis = _slender_axis(near, _cone(axis, params.refine_deg), outwards, params)
@@ -115,6 +133,23 @@ def locate_end(
     around = np.linalg.norm(shape.voxels - position, axis=1) < 2 * radius
     frames = np.quantile(shape.counts[around], 0.9) if around.any() else 0.0
     return ToolEnd(position, axis, radius, float(min(frames / cloud.frame_count, 1.0)))
+
+
+def locate_hull_end(shape: Shape, far: Array, spheres: Array, params: EndParams) -> ToolEnd:
+    """Find axis and middle of the end of a solid that ``far`` (3,), metres, lies on, roughly."""
+    outwards = _unit(far - grip_of(spheres))
+    near = shape.voxels[np.linalg.norm(shape.voxels - far, axis=1) < params.neighbourhood] - far
+    few = near[:: max(1, len(near) // _SOLID_VOXELS)]
+    axis = _slender_axis(few, _cone(outwards, params.cone_deg), outwards, params)
+    axis = _slender_axis(few, _cone(axis, params.refine_deg), outwards, params)
+    middle = far + _middle(near, axis, params.slab_radius, params)
+    radius = float(_scatter(few, axis[:, None], params.short_slab, params.wide).rms[0])
+    about = shape.voxels - middle
+    along = about @ axis
+    across = np.square(about).sum(axis=1) - along * along
+    core = across <= max(radius, 1.5 * params.voxel) ** 2
+    top = float(np.quantile(along[core], 0.98)) if core.any() else 0.0
+    return ToolEnd(middle + axis * (top - 0.5 * params.voxel), axis, radius, 0.0)
 
 
 @dataclass(frozen=True)

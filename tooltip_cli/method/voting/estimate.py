@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from tooltip_cli.method.rays import angular_spread
 from tooltip_cli.method.types import Array, Candidate, Reason, TipEstimate, refused
-from tooltip_cli.method.voting.end import Shape, ToolEnd, far_voxels, locate_end, tool_shape
+from tooltip_cli.method.voting.end import tool_shape
+from tooltip_cli.method.voting.ends import find_ends
 from tooltip_cli.method.voting.pairing import Pairing
-from tooltip_cli.method.voting.params import EndParams, TrustParams, VotingSettings
-from tooltip_cli.method.voting.refine import RefinedEnd, refine_end
+from tooltip_cli.method.voting.params import TrustParams, VotingSettings
 from tooltip_cli.method.voting.volume import Cloud, HandEdges, reconstruct
 
 METHOD = "voting"
@@ -68,15 +66,10 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     if not len(shape.voxels):
         clutter = cloud.consistent < trust.min_consistent
         return refused(METHOD, used, _nothing_consistent(cloud) if clutter else _only_the_hand())
-    found = [
-        _candidate(edges, cloud, shape, shape.voxels[far], spheres, settings)
-        for far in far_voxels(shape, settings.end)
-    ]
-    if cloud.consistent < trust.min_consistent and found[0][1] < trust.convincing_agreement:
+    found = find_ends(edges, cloud, shape, spheres, settings)
+    if cloud.consistent < trust.min_consistent and found[0].agreement < trust.convincing_agreement:
         return refused(METHOD, used, _nothing_consistent(cloud))
-    candidates = [candidate for candidate, _ in found]
-    least = settings.end.other_end_support * candidates[0].support
-    candidates = [item for item in candidates if item.support >= least]
+    candidates = [end.candidate for end in found]
     if settings.prefer is not None:
         candidates = [preferred(candidates, np.array(settings.prefer))]
     first = candidates[0]
@@ -90,102 +83,6 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
 def preferred(candidates: list[Candidate], direction: Array) -> Candidate:
     """Return the candidate that lies farthest in a direction (3,), hand frame."""
     return max(candidates, key=lambda item: float(item.position @ direction))
-
-
-def first_end(
-    edges: HandEdges, spheres: Array, settings: VotingSettings
-) -> tuple[Cloud, ToolEnd] | None:
-    """Return what was voted and its first end as the voxels give it; None: there is none."""
-    cloud = reconstruct(edges, settings.voting)
-    shape = tool_shape(cloud, spheres, edges.reach, settings.end)
-    ends = far_voxels(shape, settings.end)
-    if not len(ends):
-        return None
-    return cloud, locate_end(cloud, shape, shape.voxels[ends[0]], spheres, settings.end)
-
-
-def _candidate(
-    edges: HandEdges,
-    cloud: Cloud,
-    shape: Shape,
-    far: Array,
-    spheres: Array,
-    settings: VotingSettings,
-) -> tuple[Candidate, float]:
-    """Return the end that a far voxel (3,) lies on, put right by the images where they agree.
-
-    Returns:
-        the end, and the share of the images that agree on it; 0: too few for that.
-    """
-    end = locate_end(cloud, shape, far, spheres, settings.end)
-    refined = refine_end(
-        edges, cloud, end.position, end.axis, end.radius, settings.refine, settings.trust.seed
-    )
-    if refined is None:
-        covariance = _voted_covariance(cloud, end, far, spheres, edges.reach, settings)
-        return Candidate(end.position, end.support, covariance, end.axis), 0.0
-    covariance, axis_variance = _uncertainty(refined, settings.trust)
-    candidate = Candidate(
-        refined.position, end.support, covariance, refined.axis, axis_variance**0.5
-    )
-    return candidate, refined.agreement
-
-
-def _uncertainty(end: RefinedEnd, trust: TrustParams) -> tuple[Array, float]:
-    """Return (3, 3) m^2 and rad^2: chance, and a floor for what all frames have in common.
-
-    Calibration, motion blur and a shape that is not quite what the equations say are in every
-    frame. The last shows: fewer frames agree.
-    """
-    floor = max(trust.floor, trust.floor_px / end.pixels_per_metre)
-    doubt = 1.0 + trust.disagreement * max(trust.full_agreement - end.agreement, 0.0)
-    covariance: Array = end.position_covariance + (floor * doubt) ** 2 * np.eye(3)
-    return covariance, end.axis_variance + np.radians(trust.axis_floor_deg * doubt) ** 2
-
-
-def _voted_covariance(
-    cloud: Cloud,
-    end: ToolEnd,
-    far: Array,
-    spheres: Array,
-    reach: float,
-    settings: VotingSettings,
-) -> Array:
-    """Return (3, 3) m^2: the scatter over random halves of the frames, and a floor.
-
-    The end found from half the frames differs from that of all by as much as that of all differs
-    from the truth, as far as chance goes. What frames have in common (calibration, the shape of
-    the end, the voxels) is the floor.
-    """
-    trust = settings.trust
-    rng = np.random.default_rng(trust.seed)
-    deviations = []
-    for _ in range(trust.halves):
-        half = rng.permutation(cloud.frame_count)[: cloud.frame_count // 2]
-        kept = np.isin(cloud.frames, half)
-        part = replace(cloud, points=cloud.points[kept], frames=cloud.frames[kept])
-        found = _end_near(part, far, spheres, reach, settings.end)
-        if found is not None:
-            deviations.append(found - end.position)
-    floor = (trust.voted_floor + trust.voted_floor_per_radius * end.radius) ** 2 * np.eye(3)
-    if not deviations:
-        return floor
-    scatter = np.array(deviations)
-    covariance: Array = scatter.T @ scatter / len(scatter) + floor
-    return covariance
-
-
-def _end_near(
-    cloud: Cloud, far: Array, spheres: Array, reach: float, params: EndParams
-) -> Array | None:
-    """Return the (3,) end of a thinner cloud on the same side of the tool; None: not there."""
-    shape = tool_shape(cloud, spheres, reach, params)
-    near = np.linalg.norm(shape.voxels - far, axis=1) < params.end_separation
-    if not near.any():
-        return None
-    voxels = shape.voxels[near]
-    start = voxels[int(np.argmax(np.linalg.norm(voxels, axis=1)))]
-    return locate_end(cloud, shape, start, spheres, params).position
 
 
 def _hidden(position: Array, edges: HandEdges, trust: TrustParams) -> Reason | None:

@@ -12,6 +12,7 @@ from tooltip_cli.method.blocks import match_blocks, window_margin
 from tooltip_cli.method.canny import edge_points
 from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.params import MovingParams
+from tooltip_cli.method.voting.silhouette import FrameSilhouette, Silhouettes, join_silhouettes
 
 Image = npt.NDArray[np.uint8]
 
@@ -30,6 +31,22 @@ class MovingEdges:
     pixels: npt.NDArray[np.uint16]  # (E, 2) u, v
     translations: npt.NDArray[np.int8]  # (E, 2, 2) du, dv to each partner, pixels
     covariances: npt.NDArray[np.float32]  # (E, 2, 3) C_uu, C_uv, C_vv to each partner, px^2
+    silhouettes: Silhouettes | None = None  # of the same frames; None: the scene behind is unknown
+
+    def of_frames(self, frames: Indices) -> MovingEdges:
+        """Return the edges of some of the frames, image indices."""
+        kept = np.isin(self.frames, frames)
+        edge = kept[self.frame_of_edge]
+        return MovingEdges(
+            self.frames[kept],
+            self.partners[kept],
+            self.affines[kept],
+            self.counts[kept],
+            self.pixels[edge],
+            self.translations[edge],
+            self.covariances[edge],
+            None if self.silhouettes is None else self.silhouettes.select(kept),
+        )
 
     @property
     def frame_of_edge(self) -> Indices:
@@ -45,6 +62,7 @@ class FrameEdges:
     pixels: npt.NDArray[np.uint16]
     translations: npt.NDArray[np.int8]
     covariances: npt.NDArray[np.float32]
+    silhouette: FrameSilhouette | None = None
 
 
 def join(frames: Indices, partners: Indices, parts: list[FrameEdges]) -> MovingEdges:
@@ -57,6 +75,7 @@ def join(frames: Indices, partners: Indices, parts: list[FrameEdges]) -> MovingE
         np.concatenate([np.zeros((0, 2), np.uint16), *(part.pixels for part in parts)]),
         np.concatenate([np.zeros((0, 2, 2), np.int8), *(part.translations for part in parts)]),
         np.concatenate([np.zeros((0, 2, 3), np.float32), *(part.covariances for part in parts)]),
+        join_silhouettes([part.silhouette for part in parts]),
     )
 
 

@@ -36,6 +36,32 @@ class MovingParams:
 
 
 @dataclass(frozen=True)
+class SilhouetteParams:
+    """What counts as standing before the background."""
+
+    samples: int = 31  # images, evenly spread, that the background is learnt from
+    tolerance: float = 3.0  # standard deviations of a pixel that it may differ by
+    least_contrast: float = 8.0  # grey levels, at least
+    most_contrast: float = 60.0  # where more is needed, nothing is known
+    min_seen: float = 0.6  # share of the samples that must show the background at a pixel
+    min_area: int = 30  # pixels; smaller pieces are specks
+    max_share: float = 0.5  # of an image that may stand before the background
+
+
+@dataclass(frozen=True)
+class HullParams:
+    """The volume that stands before the background in every image; lengths in metres."""
+
+    coarse: float = 0.008  # voxels of the first pass
+    fine: float = 0.004  # voxels of the second
+    margin: float = 0.4  # of a voxel, that silhouettes are widened by
+    max_missing: float = 0.08  # share of the images in which a voxel of hand or tool may be missing
+    min_seen: float = 0.3  # share of the images that must say something of a voxel
+    max_cover: float = 0.5  # share of the images in which the hand may stand before a pixel
+    confirmed: float = 0.012  # from a voted voxel, within which a voxel is surely no bulge
+
+
+@dataclass(frozen=True)
 class VotingParams:
     """How edges become points in the hand frame, and points an end."""
 
@@ -57,7 +83,7 @@ class EndParams:
     min_frames: float = 6.0  # that agree on a voxel, smoothed over neighbours
     min_share: float = 0.12  # of what the tool's clearest voxels have
     min_voxels: int = 8  # smaller pieces are specks
-    other_end_support: float = 0.5  # nor does one with less than this share of the first's support
+    other_end_support: float = 0.65  # nor one with less than this share of the most support
     other_end_share: float = 0.8  # another end nearer to the wrist than this share does not count
     end_separation: float = 0.05  # an end is the farthest voxel within this distance
     neighbourhood: float = 0.14  # of the far voxel, that its axis is found from
@@ -115,6 +141,23 @@ class RefineParams:
 
 
 @dataclass(frozen=True)
+class OutlineParams:
+    """How an end is put right by the outlines of silhouettes; lengths in metres."""
+
+    max_move: float = 0.03  # from a start; what moves farther has found something else
+    same_end: float = 0.06  # rough ends nearer to one another than this are one end's
+    radius_factors: tuple[float, ...] = (0.5, 1.0, 2.0)  # of the rough radius, that are tried
+    frames_at_first: int = 40  # that all starts are tried on
+    rounds_at_first: int = 6
+    least_frames: int = 8  # of those, that must show the end
+    starts_kept: int = 3  # that are then tried on all frames
+    same_place: float = 0.003  # a point nearer to the end's middle than this is the end
+    beside_depth: float = 0.004  # behind a point, where the background shows beside it
+    min_missing_beside: float = 0.25  # share of the images that must show it
+    min_agreement: float = 0.5  # of frames, below which moving edges may know better
+
+
+@dataclass(frozen=True)
 class CalibrationParams:
     """What corrections of clocks and camera are expected, and when one is made."""
 
@@ -155,9 +198,12 @@ class VotingSettings:
 
     pairing: PairingParams = field(default_factory=PairingParams)
     moving: MovingParams = field(default_factory=MovingParams)
+    silhouette: SilhouetteParams = field(default_factory=SilhouetteParams)
+    hull: HullParams = field(default_factory=HullParams)
     voting: VotingParams = field(default_factory=VotingParams)
     end: EndParams = field(default_factory=EndParams)
     refine: RefineParams = field(default_factory=RefineParams)
+    outline: OutlineParams = field(default_factory=OutlineParams)
     calibration: CalibrationParams = field(default_factory=CalibrationParams)
     trust: TrustParams = field(default_factory=TrustParams)
     prefer: tuple[float, float, float] | None = (

@@ -42,6 +42,8 @@ _LEAST_WIDTH = 0.010  # metres across, looked at about the thinnest tools
 _WIDTH_PER_RADIUS, _WIDTH_MARGIN = 1.8, 0.004
 _END_MARGIN = 0.002  # metres beyond the end's sides
 _MAX_STEP, _MAX_TURN = 0.005, 0.2  # metres and radians in one round
+_AS_GOOD = 0.9  # share of the most support that a later round must have
+_LOSS_FALLS = 0.6  # by this factor in each round, until it is the last
 _WIDE_ROUNDS = 2  # before the width at the end follows what was measured
 _SETTLED = 5e-5  # metres
 _SOLVER_STEPS = 8
@@ -102,7 +104,7 @@ def refine_end(
         seed: of the resampling.
     """
     found = best_fit(near_edges(edges, cloud, position, params), position, axis, radius, params)
-    return None if found is None else _resampled(found, params, seed)
+    return None if found is None else resampled(found, params, seed)
 
 
 def best_fit(
@@ -113,7 +115,7 @@ def best_fit(
     if best is None or best.agreement(params) < params.good_agreement:
         turned = [
             fit_end(near, position, start, radius, params)
-            for start in _about(axis, params.start_turn_deg)
+            for start in turned_axes(axis, params.start_turn_deg)
         ]
         fits = [fit for fit in (best, *turned) if fit is not None]
         best = max(fits, key=lambda fit: fit.agreement(params), default=None)
@@ -132,7 +134,7 @@ def looked_at(radius: float) -> float:
     return max(_WIDTH_PER_RADIUS * radius + _WIDTH_MARGIN, _LEAST_WIDTH)
 
 
-def _about(axis: Array, degrees: float) -> Array:
+def turned_axes(axis: Array, degrees: float) -> Array:
     """Return (6, 3) unit vectors at an angle to an axis (3,), evenly round it."""
     turns = np.arange(6) * np.pi / 3
     basis = across_axis(axis)
@@ -151,6 +153,7 @@ class Fit:
     position: Array  # (3,) metres, hand frame
     axis: Array  # (3,) unit vector, hand frame
     pixels_per_metre: float
+    radius: float  # metres, the rough one that it began with
     end_width: float  # metres across, that was looked at
     pointed: bool  # whether that is one thing beside others
 
@@ -179,40 +182,52 @@ def fit_end(
     radius: float,
     params: RefineParams,
     end_width: float | None = None,
+    steps: int = _SOLVER_STEPS,
+    first_round: int = 0,
 ) -> Fit | None:
     """Measure and solve until the end stays; None: too few frames, or it went elsewhere.
 
+    Measuring anew may lead away from what was found: the last round is returned that has nearly as
+    much support as any.
+
     Args:
         end_width: across, that is looked at about a pointed end; None: an end as any.
+        steps: of the solver in each round.
+        first_round: later ones look more closely, from a start that is nearly right.
     """
     pixels = near.scale_at(start)
     pointed, width, at = end_width is not None, looked_at(radius), start
     end_width = width if end_width is None else end_width
     thinnest = max(params.end_slab, params.end_slab_px / pixels)
-    loss, last_loss = params.first_loss_px / pixels, params.loss_px / pixels
+    last_loss = params.loss_px / pixels
     outlines = np.tile([0.8 * radius, 0.0, 0.8 * radius], len(SLABS) + 2)
-    for index in range(params.rounds):
+    fits: list[tuple[float, Fit]] = []
+    for index in range(first_round, params.rounds):
+        loss = max(_LOSS_FALLS**index * params.first_loss_px / pixels, last_loss)
         last = thinnest if pointed else _FIRST_END_SLAB - _END_SLAB_STEP * index
         slabs = np.array([(-max(last, thinnest), BEYOND_END), *SLABS])
         sight = see(near, at, axis)
         measured = measure(near, sight, slabs, width, end_width, params)
         if np.isfinite(measured.stops).sum() < params.min_frames:
-            return None
+            break
         system = equations(sight, measured, slabs, axis, radius, params)
-        unknowns = solve(
-            system, np.concatenate([np.zeros(LINE), outlines]), loss, params, _SOLVER_STEPS
-        )
+        unknowns = solve(system, np.concatenate([np.zeros(LINE), outlines]), loss, params, steps)
         step, turn, outlines = unknowns[:3], system.basis @ unknowns[5:LINE], unknowns[LINE:]
         at = at + _at_most(step, _MAX_STEP)
         axis = axis + _at_most(turn, _MAX_TURN)
         axis = axis / np.linalg.norm(axis)
         end_width = _next_width(measured.halves[:, 0], end_width, width, pointed, index, params)
-        if np.linalg.norm(step) < _SETTLED and loss <= last_loss:
+        if loss > last_loss:
+            continue
+        fit = Fit(
+            system, unknowns, loss, at, axis, pixels, radius, end_width, pointed, len(sight.scale)
+        )
+        if np.linalg.norm(at - start) < params.max_move:
+            fits.append((fit.support(params), fit))
+        if np.linalg.norm(step) < _SETTLED:
             break
-        loss = max(0.6 * loss, last_loss)
-    if np.linalg.norm(at - start) > params.max_move:
-        return None
-    return Fit(system, unknowns, loss, at, axis, pixels, end_width, pointed, len(sight.scale))
+    most = max((support for support, _ in fits), default=0.0)
+    return next((fit for support, fit in reversed(fits) if support >= _AS_GOOD * most), None)
 
 
 def _next_width(
@@ -232,7 +247,7 @@ def _at_most(vector: Array, length: float) -> Array:
     return vector * min(1.0, length / max(float(np.linalg.norm(vector)), 1e-12))
 
 
-def _resampled(fit: Fit, params: RefineParams, seed: int) -> RefinedEnd:
+def resampled(fit: Fit, params: RefineParams, seed: int) -> RefinedEnd:
     """Resample the frames (bootstrap) for the uncertainty."""
     system, unknowns = fit.system, fit.unknowns
     rng = np.random.default_rng(seed)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.params import RefineParams
+from tooltip_cli.method.voting.silhouette import HandSilhouettes
 from tooltip_cli.method.voting.volume import Cloud, HandEdges
 
 _FARTHEST = 3  # edges of a frame, whose median is its farthest one
@@ -24,11 +25,24 @@ class NearEdges:
 
     pixels: Array  # (E, 2) ideal pixels about the optical centre
     rows: Indices  # (E,) row of the chosen frames
-    profiles: npt.NDArray[np.float32]  # (E, depths) log-likelihood ratios over depth
+    profiles: npt.NDArray[np.float32]  # (E, depths) log-likelihood ratios over depth; 0 depths: all
     first: Array  # (E,) depth of a profile's first sample, metres
     step: Array  # (E,) between its samples, metres
     camera_from_hand: Array  # (F, 4, 4) of the chosen frames
     focal_px: float
+
+    def thinned(self, every: int) -> NearEdges:
+        """Return the same of one in so many frames."""
+        kept = self.rows % every == 0
+        return NearEdges(
+            self.pixels[kept],
+            self.rows[kept] // every,
+            self.profiles[kept],
+            self.first[kept],
+            self.step[kept],
+            self.camera_from_hand[::every],
+            self.focal_px,
+        )
 
     def scale_at(self, position: Array) -> float:
         """Return the median over the frames of pixels per metre at a point (3,), hand frame."""
@@ -79,6 +93,26 @@ def near_edges(edges: HandEdges, cloud: Cloud, position: Array, params: RefinePa
     )
 
 
+def near_outlines(silhouettes: HandSilhouettes, position: Array, params: RefineParams) -> NearEdges:
+    """Return the points of silhouettes' outlines that lie near a point (3,), hand frame."""
+    camera = silhouettes.camera_from_hand
+    at = camera[:, :3, :3] @ position + camera[:, :3, 3]
+    rows = silhouettes.rows
+    away = silhouettes.points - (at[:, :2] / at[:, 2:])[rows]
+    limit = (params.reach + 2 * params.max_move) / at[:, 2]
+    near = np.square(away).sum(axis=1) < np.square(limit)[rows]
+    rows = rows[near]
+    return NearEdges(
+        silhouettes.focal_px * silhouettes.points[near],
+        rows,
+        np.zeros((len(rows), 0), np.float32),
+        np.zeros(len(rows)),
+        np.ones(len(rows)),
+        camera,
+        silhouettes.focal_px,
+    )
+
+
 def see(near: NearEdges, position: Array, axis: Array) -> Sight:
     """Project an end (3,) with its axis (3,) into all frames."""
     rotation = near.camera_from_hand[:, :3, :3]
@@ -101,7 +135,7 @@ def see(near: NearEdges, position: Array, axis: Array) -> Sight:
         near.focal_px / depth,
         sine,
         depth,
-        towards[:, 2],
+        np.ascontiguousarray(towards[:, 2]),
         lifted(along),
         lifted(_left_of(along)),
     )
@@ -200,21 +234,33 @@ def _on_tool(
         of each edge its frame's row, metres along the axis in the image, metres across, and
         metres along the axis itself.
     """
-    rows = near.rows
-    away = near.pixels - sight.pixel[rows]
-    scale = sight.scale[rows]
-    along = (away * sight.along[rows]).sum(axis=1) / scale
-    across = (away * _left_of(sight.along)[rows]).sum(axis=1) / scale
-    inside = (np.abs(across) < width) & (along < params.beyond) & (along > -params.reach)
-    inside &= sight.sine[rows] > params.min_sine
-    rows, along, across = rows[inside], along[inside], across[inside]
-    lengthwise = along / sight.sine[rows]
-    depth = sight.depth[rows] + np.minimum(lengthwise, 0.0) * sight.axis_depth[rows]
-    sample = np.round((depth - near.first[inside]) / near.step[inside]).astype(np.intp)
-    profiles = near.profiles[inside]
-    ratios = profiles[np.arange(len(rows)), np.clip(sample, 0, profiles.shape[1] - 1)]
-    fits = ratios > params.min_ratio
-    return rows[fits], along[fits], across[fits], lengthwise[fits]
+    from tooltip_cli.method._voting_numba import on_tool_kernel
+
+    rows = np.empty(len(near.rows), dtype=np.intp)
+    along, across, lengthwise = np.empty((3, len(near.rows)))
+    count = on_tool_kernel()(
+        near.pixels,
+        near.rows,
+        near.profiles,
+        near.first,
+        near.step,
+        sight.pixel,
+        sight.along,
+        sight.scale,
+        sight.sine,
+        sight.depth,
+        sight.axis_depth,
+        width,
+        params.reach,
+        params.beyond,
+        params.min_sine,
+        params.min_ratio,
+        rows,
+        along,
+        across,
+        lengthwise,
+    )
+    return rows[:count], along[:count], across[:count], lengthwise[:count]
 
 
 def _left_of(along: Array) -> Array:
@@ -222,7 +268,13 @@ def _left_of(along: Array) -> Array:
 
 
 def _ranked(rows: Indices, values: Array, frames: int) -> tuple[Array, Indices, Indices]:
-    """Return values sorted within each frame, (F,) where each frame starts, and (F,) counts."""
-    order = np.lexsort((values, rows))
+    """Return values sorted within each frame, (F,) where each frame starts, and (F,) counts.
+
+    Args:
+        values: metres, all far below one.
+    """
+    # one sort of single numbers takes a fifth of the time of a sort by two keys
+    keys = np.sort(10.0 * rows + values)
     counts = np.bincount(rows, minlength=frames)
-    return values[order], np.cumsum(counts) - counts, counts
+    starts = np.cumsum(counts) - counts
+    return keys - 10.0 * np.repeat(np.arange(frames), counts), starts, counts

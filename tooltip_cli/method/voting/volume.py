@@ -10,6 +10,7 @@ import numpy.typing as npt
 from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.moving import MovingEdges
 from tooltip_cli.method.voting.params import VotingParams
+from tooltip_cli.method.voting.silhouette import HandSilhouettes
 
 Volume = npt.NDArray[np.float32]
 
@@ -36,6 +37,7 @@ class HandEdges:
     focal_px: float  # ideal pixels per unit of normalized coordinates
     extent: Array  # (2, 2) smallest and largest normalized coordinates in the image
     reach: float  # metres from the hand's origin
+    silhouettes: HandSilhouettes | None = None  # of the same images; None: nothing is known
 
 
 @dataclass(frozen=True)

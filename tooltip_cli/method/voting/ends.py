@@ -1,0 +1,277 @@
+"""All ends that the tool may have, each put right by what the images show of it.
+
+Rough ends come from the voted voxels and from the visual hull, which err in different ways: votes
+are smeared along rays and miss what has no edges; the hull bulges where no image looks along its
+side. So the hull is trusted where votes confirm it, and several starts are tried.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tooltip_cli.method.types import Array, Candidate
+from tooltip_cli.method.voting.end import (
+    Shape,
+    ToolEnd,
+    far_voxels,
+    grip_of,
+    locate_end,
+    locate_hull_end,
+    tool_shape,
+)
+from tooltip_cli.method.voting.hull import visual_hull
+from tooltip_cli.method.voting.outline import fit_outlines
+from tooltip_cli.method.voting.params import (
+    EndParams,
+    RefineParams,
+    TrustParams,
+    VotingSettings,
+)
+from tooltip_cli.method.voting.refine import Fit, RefinedEnd, refine_end, resampled
+from tooltip_cli.method.voting.sight import NearEdges, near_edges, near_outlines
+from tooltip_cli.method.voting.volume import Cloud, HandEdges, reconstruct
+
+
+@dataclass(frozen=True)
+class FoundEnd:
+    """One end of the tool, and how far to trust it."""
+
+    candidate: Candidate
+    agreement: float  # share of what the images show of it that fits; 0: too few images do
+
+
+@dataclass(frozen=True)
+class _Rough:
+    """Where an end may be."""
+
+    far: Array  # (3,) metres, hand frame: the voxel of it that is farthest from the wrist
+    voted: ToolEnd | None
+    solid: tuple[ToolEnd, ...]  # as the hull has it
+
+
+def find_ends(
+    edges: HandEdges, cloud: Cloud, shape: Shape, spheres: Array, settings: VotingSettings
+) -> list[FoundEnd]:
+    """Return the tool's ends, the farthest from the wrist first; at least one.
+
+    Args:
+        shape: where the votes say that hand or tool is; not empty.
+        spheres: (S, 4) centre and radius of hand and wrist, metres.
+    """
+    ends: list[FoundEnd] = []
+    for rough in _rough_ends(edges, cloud, shape, spheres, settings):
+        end = _by_outlines(edges, rough, spheres, settings)
+        if rough.voted is not None and (
+            end is None or end.agreement < settings.outline.min_agreement
+        ):
+            by_edges = _by_edges(edges, cloud, rough.far, rough.voted, spheres, settings)
+            end = by_edges if end is None or by_edges.agreement > end.agreement else end
+        if end is not None:
+            ends.append(end)
+    return _apart(ends, settings.end)
+
+
+def _apart(ends: list[FoundEnd], params: EndParams) -> list[FoundEnd]:
+    """Return ends that differ, the farthest first; of those at one place the best.
+
+    One that far fewer images show, or agree on, than on another is no end that could be meant.
+    """
+    kept: list[FoundEnd] = []
+    for end in sorted(ends, key=lambda item: -item.agreement):
+        apart = [end.candidate.position - other.candidate.position for other in kept]
+        if all(np.linalg.norm(away) > 0.5 * params.end_separation for away in apart):
+            kept.append(end)
+    share = params.other_end_support
+    agreement = share * max(end.agreement for end in kept)
+    support = share * max(end.candidate.support for end in kept)
+    kept = [
+        end for end in kept if end.agreement >= agreement and end.candidate.support >= support
+    ] or kept[:1]
+    kept.sort(key=lambda end: -float(np.linalg.norm(end.candidate.position)))
+    least = params.other_end_share * np.linalg.norm(kept[0].candidate.position)
+    return [end for end in kept if np.linalg.norm(end.candidate.position) >= least]
+
+
+def _rough_ends(
+    edges: HandEdges, cloud: Cloud, shape: Shape, spheres: Array, settings: VotingSettings
+) -> list[_Rough]:
+    params, same = settings.end, settings.outline.same_end
+    votes = [
+        (shape.voxels[far], locate_end(cloud, shape, shape.voxels[far], spheres, params))
+        for far in far_voxels(shape, params)
+    ]
+    silhouettes = edges.silhouettes
+    rough: list[_Rough] = []
+    if silhouettes is not None:
+        hull = visual_hull(silhouettes, spheres, edges.reach, settings.hull)
+        sure = _confirmed(hull, shape, settings.hull.confirmed)
+        bulges = [hull.voxels[row] for row in far_voxels(hull, params)]
+        for row in far_voxels(sure, params):
+            far = sure.voxels[row]
+            near = [end for at, end in votes if np.linalg.norm(at - far) < same]
+            solid = [locate_hull_end(sure, far, spheres, params)]
+            solid += [
+                locate_hull_end(hull, bulge, spheres, params)
+                for bulge in bulges
+                if np.linalg.norm(bulge - far) < same
+            ]
+            rough.append(_Rough(far, near[0] if near else None, tuple(solid)))
+    for far, end in votes:
+        if all(np.linalg.norm(far - other.far) >= same for other in rough):
+            rough.append(_Rough(far, end, ()))
+    return rough
+
+
+def _confirmed(hull: Shape, shape: Shape, within: float) -> Shape:
+    """Return the hull's voxels that have a voted one nearby, metres."""
+    from scipy.spatial import KDTree
+
+    if not len(hull.voxels):
+        return hull
+    distances, _ = KDTree(shape.voxels).query(hull.voxels, distance_upper_bound=within)
+    near = np.isfinite(distances)
+    return Shape(hull.voxels[near], hull.counts[near])
+
+
+@dataclass(frozen=True)
+class ClosePart:
+    """The tool's first end, roughly, with all edges about it."""
+
+    near: NearEdges
+    position: Array  # (3,) metres, hand frame
+    axis: Array  # (3,) unit vector, hand frame
+    radius: float  # metres
+
+
+def first_end(edges: HandEdges, spheres: Array, settings: VotingSettings) -> ClosePart | None:
+    """Return the first end as well as it can be told with wrong clocks or cameras; None: none.
+
+    Args:
+        spheres: (S, 4) centre and radius of hand and wrist, metres.
+    """
+    cloud = reconstruct(edges, settings.voting)
+    shape = tool_shape(cloud, spheres, edges.reach, settings.end)
+    if not len(shape.voxels):
+        return None
+    rough, *others = _rough_ends(edges, cloud, shape, spheres, settings)
+    refine = settings.refine
+    fit = _outline_fit(
+        edges, rough, spheres, settings, replace(refine, loss_px=refine.first_loss_px)
+    )
+    if fit is not None and edges.silhouettes is not None:
+        near = near_outlines(edges.silhouettes, fit.position, refine)
+        return ClosePart(near, fit.position, fit.axis, fit.radius)
+    voted = next((item.voted for item in (rough, *others) if item.voted is not None), None)
+    if voted is None:
+        return None
+    near = near_edges(edges, cloud, voted.position, refine)
+    return ClosePart(near, voted.position, voted.axis, voted.radius)
+
+
+def _outline_fit(
+    edges: HandEdges,
+    rough: _Rough,
+    spheres: Array,
+    settings: VotingSettings,
+    refine: RefineParams,
+) -> Fit | None:
+    """Return what the silhouettes' outlines say of an end; None: there are none, or nothing."""
+    if edges.silhouettes is None:
+        return None
+    starts = [*rough.solid, *([] if rough.voted is None else [rough.voted])]
+    fit = fit_outlines(edges.silhouettes, starts, grip_of(spheres), refine, settings.outline)
+    return None if fit is None or fit.agreement(refine) < refine.min_agreement else fit
+
+
+def _by_outlines(
+    edges: HandEdges, rough: _Rough, spheres: Array, settings: VotingSettings
+) -> FoundEnd | None:
+    """Put an end right by the silhouettes' outlines; None: there are none, or too few agree."""
+    fit = _outline_fit(edges, rough, spheres, settings, settings.refine)
+    if fit is None:
+        return None
+    refined = resampled(fit, settings.refine, settings.trust.seed)
+    return _refined(refined, fit.support(settings.refine), settings)
+
+
+def _by_edges(
+    edges: HandEdges,
+    cloud: Cloud,
+    far: Array,
+    end: ToolEnd,
+    spheres: Array,
+    settings: VotingSettings,
+) -> FoundEnd:
+    """Put a voted end right by the moving edges of all images, where they agree."""
+    refined = refine_end(
+        edges, cloud, end.position, end.axis, end.radius, settings.refine, settings.trust.seed
+    )
+    if refined is None:
+        covariance = _voted_covariance(cloud, end, far, spheres, edges.reach, settings)
+        return FoundEnd(Candidate(end.position, end.support, covariance, end.axis), 0.0)
+    return _refined(refined, end.support, settings)
+
+
+def _refined(end: RefinedEnd, support: float, settings: VotingSettings) -> FoundEnd:
+    covariance, axis_variance = _uncertainty(end, settings.trust)
+    candidate = Candidate(end.position, support, covariance, end.axis, axis_variance**0.5)
+    return FoundEnd(candidate, end.agreement)
+
+
+def _uncertainty(end: RefinedEnd, trust: TrustParams) -> tuple[Array, float]:
+    """Return (3, 3) m^2 and rad^2: chance, and a floor for what all frames have in common.
+
+    Calibration, motion blur and a shape that is not quite what the equations say are in every
+    frame. The last shows: fewer frames agree.
+    """
+    floor = max(trust.floor, trust.floor_px / end.pixels_per_metre)
+    doubt = 1.0 + trust.disagreement * max(trust.full_agreement - end.agreement, 0.0)
+    covariance: Array = end.position_covariance + (floor * doubt) ** 2 * np.eye(3)
+    return covariance, end.axis_variance + np.radians(trust.axis_floor_deg * doubt) ** 2
+
+
+def _voted_covariance(
+    cloud: Cloud,
+    end: ToolEnd,
+    far: Array,
+    spheres: Array,
+    reach: float,
+    settings: VotingSettings,
+) -> Array:
+    """Return (3, 3) m^2: the scatter over random halves of the frames, and a floor.
+
+    The end found from half the frames differs from that of all by as much as that of all differs
+    from the truth, as far as chance goes. What frames have in common (calibration, the shape of
+    the end, the voxels) is the floor.
+    """
+    trust = settings.trust
+    rng = np.random.default_rng(trust.seed)
+    deviations = []
+    for _ in range(trust.halves):
+        half = rng.permutation(cloud.frame_count)[: cloud.frame_count // 2]
+        kept = np.isin(cloud.frames, half)
+        part = replace(cloud, points=cloud.points[kept], frames=cloud.frames[kept])
+        found = _end_near(part, far, spheres, reach, settings.end)
+        if found is not None:
+            deviations.append(found - end.position)
+    floor = (trust.voted_floor + trust.voted_floor_per_radius * end.radius) ** 2 * np.eye(3)
+    if not deviations:
+        return floor
+    scatter = np.array(deviations)
+    covariance: Array = scatter.T @ scatter / len(scatter) + floor
+    return covariance
+
+
+def _end_near(
+    cloud: Cloud, far: Array, spheres: Array, reach: float, params: EndParams
+) -> Array | None:
+    """Return the (3,) end of a thinner cloud on the same side of the tool; None: not there."""
+    shape = tool_shape(cloud, spheres, reach, params)
+    near = np.linalg.norm(shape.voxels - far, axis=1) < params.end_separation
+    if not near.any():
+        return None
+    voxels = shape.voxels[near]
+    start = voxels[int(np.argmax(np.linalg.norm(voxels, axis=1)))]
+    return locate_end(cloud, shape, start, spheres, params).position

@@ -1,0 +1,123 @@
+"""The volume that stands before the background in all images: the visual hull of hand and tool.
+
+A voxel of hand or tool never shows the background; one beside them does in some image. Seen from
+the hand the camera goes round it, so what no image carves away hugs the tool.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from tooltip_cli.method.rays import plausible
+from tooltip_cli.method.types import Array
+from tooltip_cli.method.voting.end import Shape
+from tooltip_cli.method.voting.params import HullParams
+from tooltip_cli.method.voting.silhouette import FOREGROUND, UNKNOWN, HandSilhouettes, Image
+from tooltip_cli.method.voting.volume import grid_axis
+
+_MIN_VOXELS = 8  # smaller pieces are specks
+_CHILDREN = np.array(np.meshgrid(*[[-0.25, 0.25]] * 3)).reshape(3, -1).T
+
+
+def visual_hull(
+    silhouettes: HandSilhouettes, spheres: Array, reach: float, params: HullParams
+) -> Shape:
+    """Return the voxels outside the hand's spheres that hardly any image carves away.
+
+    Args:
+        spheres: (S, 4) centre and radius of hand and wrist, metres.
+        reach: metres from the hand's origin.
+    """
+    camera, view = silhouettes.camera_from_hand, silhouettes.view
+    masks = _where_the_hand_hides(silhouettes.masks, camera, view, spheres, params)
+    cameras = np.ascontiguousarray(view @ camera[:, :3])
+    axis = grid_axis(reach, params.coarse)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    voxels = grid[np.square(grid).sum(axis=1) < reach * reach]
+    kept, _ = _uncarved(voxels, cameras, masks, params.coarse, params)
+    voxels = (voxels[kept][:, None] + params.coarse * _CHILDREN).reshape(-1, 3)
+    kept, frames = _uncarved(voxels, cameras, masks, params.fine, params)
+    return _pieces(voxels[kept], frames[kept], spheres, params.fine)
+
+
+def missing(silhouettes: HandSilhouettes, points: Array) -> Array:
+    """Return (P,) the share of the images that show the background at points (P, 3), hand frame."""
+    from tooltip_cli.method._voting_numba import carve_kernel
+
+    cameras = np.ascontiguousarray(silhouettes.view @ silhouettes.camera_from_hand[:, :3])
+    inside, carved = np.zeros((2, len(points)), dtype=np.int32)
+    masks = np.ascontiguousarray(silhouettes.masks)
+    carve_kernel()(np.ascontiguousarray(points), cameras, masks, len(masks), inside, carved)
+    return np.asarray(carved / np.maximum(inside + carved, 1))
+
+
+def _where_the_hand_hides(
+    masks: Image, camera_from_hand: Array, view: Array, spheres: Array, params: HullParams
+) -> Image:
+    """Forget pixels that the hand stands before most of the time: the background learnt there may
+    be the hand."""
+    import cv2
+
+    covered = np.zeros(masks.shape[1:], dtype=np.float32)
+    for pose in camera_from_hand:
+        hand = np.zeros(masks.shape[1:], dtype=np.uint8)
+        for *centre, radius in spheres:
+            at = pose[:3, :3] @ np.array(centre) + pose[:3, 3]
+            if at[2] > radius:
+                u, v = (view @ at)[:2] / at[2]
+                size = view[0, 0] * radius / at[2]
+                if abs(u) < 1e4 and abs(v) < 1e4:
+                    cv2.circle(hand, (round(u), round(v)), round(size), 1, -1)
+        covered += hand
+    hidden = covered > params.max_cover * len(camera_from_hand)
+    return np.where(hidden[None], np.uint8(UNKNOWN), masks)
+
+
+def _uncarved(
+    voxels: Array, cameras: Array, masks: Image, size: float, params: HullParams
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int32]]:
+    """Return (V,) which voxels stay, and (V,) how many silhouettes each lies in."""
+    import cv2
+
+    from tooltip_cli.method._voting_numba import carve_kernel
+
+    ahead = cameras[:, 2, 3]
+    scale = float(np.median(cameras[:, 0, 0] ** 2 + cameras[:, 0, 1] ** 2 + cameras[:, 0, 2] ** 2))
+    pixels = scale**0.5 / float(np.median(ahead)) * size
+    side = 2 * max(1, round(params.margin * pixels)) + 1
+    square = np.ones((side, side), np.uint8)
+    wide = np.stack(
+        [np.maximum(mask, cv2.dilate((mask == FOREGROUND) * mask, square)) for mask in masks]
+    )
+    order = np.random.default_rng(0).permutation(len(wide))  # unlike views carve soonest
+    inside = np.zeros(len(voxels), dtype=np.int32)
+    carved = np.zeros(len(voxels), dtype=np.int32)
+    limit = int(params.max_missing * len(wide))
+    carve_kernel()(
+        np.ascontiguousarray(voxels),
+        np.ascontiguousarray(cameras[order]),
+        np.ascontiguousarray(wide[order]),
+        limit,
+        inside,
+        carved,
+    )
+    said = inside + carved
+    kept = (said >= params.min_seen * len(wide)) & (carved <= params.max_missing * said)
+    return kept, inside
+
+
+def _pieces(voxels: Array, frames: npt.NDArray[np.int32], spheres: Array, size: float) -> Shape:
+    """Return what lies outside the hand, without specks."""
+    from scipy import ndimage
+
+    if not len(voxels):
+        return Shape(np.zeros((0, 3)), np.zeros(0))
+    index = np.round((voxels - voxels.min(axis=0)) / size).astype(int)
+    occupied = np.zeros(index.max(axis=0) + 1, dtype=bool)
+    occupied[tuple(index.T)] = True
+    parts, count = ndimage.label(occupied, structure=np.ones((3, 3, 3)))
+    part = parts[tuple(index.T)]
+    large = np.bincount(part, minlength=count + 1)[part] >= _MIN_VOXELS
+    kept = large & plausible(voxels, spheres, np.inf)
+    return Shape(voxels[kept], frames[kept].astype(float))

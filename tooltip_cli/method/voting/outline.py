@@ -1,0 +1,138 @@
+"""An end put right by the outlines of silhouettes: many starts, and the one that explains most.
+
+The equations are those of ``refine.py``. An outline has no edges inside it and hardly any gaps, so
+more images agree, and a start may be far off: all starts are tried on some of the images, and the
+best of them on all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tooltip_cli.method.types import Array
+from tooltip_cli.method.voting.end import ToolEnd
+from tooltip_cli.method.voting.hull import missing
+from tooltip_cli.method.voting.params import OutlineParams, RefineParams
+from tooltip_cli.method.voting.refine import Fit, fit_end, looked_at, turned_axes
+from tooltip_cli.method.voting.sight import NearEdges, near_outlines, point_of
+from tooltip_cli.method.voting.silhouette import HandSilhouettes
+
+_STEPS_AT_FIRST, _STEPS = 2, 8  # of the solver in each round
+_CLOSE = 4  # the first round that looks as closely as the last
+
+
+@dataclass(frozen=True)
+class _Start:
+    position: Array  # (3,) metres, hand frame
+    axis: Array  # (3,) unit vector
+    radius: float  # metres
+
+
+def fit_outlines(
+    silhouettes: HandSilhouettes,
+    ends: Sequence[ToolEnd],
+    grip: Array,
+    refine: RefineParams,
+    params: OutlineParams,
+) -> Fit | None:
+    """Return the end that explains most of what the outlines show about some rough ends.
+
+    Args:
+        ends: rough ends, within a few centimetres of one another.
+        grip: (3,) metres, hand frame; the tool leads away from it.
+    """
+    refine = replace(refine, max_move=params.max_move)
+    centre = np.mean([end.position for end in ends], axis=0)
+    near = near_outlines(silhouettes, centre, refine)
+    every = max(1, len(near.camera_from_hand) // params.frames_at_first)
+    few = replace(
+        refine,
+        rounds=params.rounds_at_first,
+        min_frames=max(refine.min_frames // every, params.least_frames),
+    )
+    tried = _fits(near.thinned(every), _starts(ends, grip, refine, params), few, _STEPS_AT_FIRST)
+    best = [
+        _Start(fit.position, fit.axis, start.radius) for start, fit in tried[: params.starts_kept]
+    ]
+    fits = _fits(near, best, refine, first_round=_CLOSE)
+    if not fits:
+        return None
+    start, best_fit = fits[0]
+    return _at_point(silhouettes, near, best_fit, start.radius, refine, params)
+
+
+def _starts(
+    ends: Sequence[ToolEnd], grip: Array, refine: RefineParams, params: OutlineParams
+) -> list[_Start]:
+    starts = []
+    for end in ends:
+        outwards = end.position - grip
+        axes = [
+            end.axis,
+            *turned_axes(end.axis, refine.start_turn_deg),
+            outwards / max(float(np.linalg.norm(outwards)), 1e-9),
+        ]
+        starts += [
+            _Start(end.position, axis, factor * end.radius)
+            for factor in params.radius_factors
+            for axis in axes
+        ]
+    return starts
+
+
+def _fits(
+    near: NearEdges,
+    starts: Iterable[_Start],
+    refine: RefineParams,
+    steps: int = _STEPS,
+    first_round: int = 0,
+) -> list[tuple[_Start, Fit]]:
+    """Return the fits from all starts that lead somewhere, the one with most support first."""
+    fits = [
+        (
+            start,
+            fit_end(
+                near,
+                start.position,
+                start.axis,
+                start.radius,
+                refine,
+                steps=steps,
+                first_round=first_round,
+            ),
+        )
+        for start in starts
+    ]
+    found = [(start, fit) for start, fit in fits if fit is not None]
+    return sorted(found, key=lambda item: -item[1].support(refine))
+
+
+def _at_point(
+    silhouettes: HandSilhouettes,
+    near: NearEdges,
+    fit: Fit,
+    radius: float,
+    refine: RefineParams,
+    params: OutlineParams,
+) -> Fit:
+    """Go to the one thing that reaches farthest, if it stands alone: a plug's longest pin.
+
+    A flat end's corner reaches farthest as well, but the background does not show beside it.
+    """
+    step = point_of(near, fit.position, fit.axis, looked_at(radius), refine)
+    if step is None:
+        return fit
+    at = fit.position + step
+    pointed = fit_end(near, at, fit.axis, radius, refine, refine.point_width)
+    if pointed is None or pointed.agreement(refine) < refine.min_agreement:
+        return fit
+    aside = fit.position - pointed.position
+    aside = aside - (aside @ pointed.axis) * pointed.axis
+    if np.linalg.norm(aside) < params.same_place:
+        return max(fit, pointed, key=lambda item: item.support(refine))
+    behind = pointed.position - params.beside_depth * pointed.axis
+    beside = missing(silhouettes, behind + np.outer([0.5, 1.0], aside))
+    return pointed if beside.max() > params.min_missing_beside else fit

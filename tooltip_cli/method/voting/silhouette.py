@@ -1,0 +1,219 @@
+"""What stands before the background, and its outline in every image.
+
+The scene behind the hand hardly changes while the wrist turns, so the median of many images is the
+scene without hand and tool, and what differs from it is hand or tool. Unlike moving edges,
+silhouettes need neither texture nor motion from one image to the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tooltip_cli.method.types import Array, Indices
+from tooltip_cli.method.voting.params import SilhouetteParams
+
+Image = npt.NDArray[np.uint8]
+
+UNKNOWN, BACKGROUND, FOREGROUND = 0, 127, 255
+"""Values of a mask, which can so be looked at."""
+
+NOTHING_KNOWN = 255
+"""The tolerance of a pixel at which the background was not seen."""
+
+_MASK_WIDTH = 400  # pixels; masks of wider images are stored at half, a third, ... of the size
+_BLUR_PX = 0.8  # standard deviation, of image and backdrop before they are compared
+_PLATEAU_PX = 7  # side of the square in which the contrast at an outline is looked up
+_NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0))  # rows and columns
+_GAUSSIAN_PER_MAD = 1.4826
+_MAD_PER_TOLERANCE = 1.3  # a pixel is as it was within this many tolerances
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """The scene without hand and tool, as it is seen from one pose of the camera."""
+
+    colour: Image  # (H, W, C), blurred as images are before they are compared
+    tolerance: Image  # (H, W) grey levels by which it may differ, or NOTHING_KNOWN
+
+
+@dataclass(frozen=True)
+class FrameSilhouette:
+    """What stands before the background in one image."""
+
+    mask: Image  # (h, w) UNKNOWN, BACKGROUND or FOREGROUND
+    scale: int  # pixels of the image that one of the mask stands for, along a side
+    contour: npt.NDArray[np.float32]  # (K, 2) u, v of points on its outline, pixels
+
+
+@dataclass(frozen=True)
+class Silhouettes:
+    """The same for many images."""
+
+    masks: Image  # (F, h, w)
+    scale: int
+    counts: npt.NDArray[np.int64]  # (F,) points on each outline
+    contours: npt.NDArray[np.float32]  # (K, 2) u, v, frame by frame
+
+    @property
+    def row_of_point(self) -> Indices:
+        """(K,) row of ``masks`` that each point belongs to."""
+        return np.repeat(np.arange(len(self.masks)), self.counts)
+
+    def select(self, rows: npt.NDArray[np.bool_]) -> Silhouettes:
+        """Return some of them, (F,) of ``rows``."""
+        points = self.contours[rows[self.row_of_point]]
+        return Silhouettes(self.masks[rows], self.scale, self.counts[rows], points)
+
+
+@dataclass(frozen=True)
+class HandSilhouettes:
+    """Silhouettes with all that is needed to see them from the hand; no lens distorts them."""
+
+    camera_from_hand: Array  # (F, 4, 4) of the silhouettes' images
+    masks: Image  # (F, h, w)
+    view: Array  # (3, 3) from normalized coordinates to a mask's pixels
+    points: Array  # (K, 2) normalized coordinates x/z, y/z of the outlines' points
+    rows: Indices  # (K,) silhouette that each belongs to
+    focal_px: float  # ideal pixels of an image per unit of normalized coordinates
+
+
+def join_silhouettes(parts: Sequence[FrameSilhouette | None]) -> Silhouettes | None:
+    """Put the silhouettes of images of one size together; None where one is missing."""
+    known = [part for part in parts if part is not None]
+    if not known or len(known) < len(parts):
+        return None
+    return Silhouettes(
+        np.stack([part.mask for part in known]),
+        known[0].scale,
+        np.array([len(part.contour) for part in known], dtype=np.int64),
+        np.concatenate([part.contour for part in known]),
+    )
+
+
+def learn_backdrop(samples: Image, params: SilhouetteParams) -> Backdrop:
+    """Find the scene without hand and tool: the median of images, and how much each pixel varies.
+
+    Where hand or tool stand in many of the images, or the scene itself changes, nothing is known.
+
+    Args:
+        samples: (S, H, W, C) images, all as seen from one pose of the camera.
+    """
+    import cv2
+
+    middle = len(samples) // 2
+    colour = np.ascontiguousarray(np.partition(samples, middle, axis=0)[middle])
+    off = np.stack([_largest(cv2.absdiff(sample, colour)) for sample in samples])
+    spread = np.partition(off, middle, axis=0)[middle]
+    noise = max(float(np.median(spread)), 1.0)
+    tolerance = params.tolerance * _GAUSSIAN_PER_MAD * np.maximum(spread, noise)
+    tolerance = np.clip(tolerance, params.least_contrast, 254.0)
+    seen = (off <= _MAD_PER_TOLERANCE * tolerance).mean(axis=0)
+    unknown = (seen < params.min_seen) | (tolerance > params.most_contrast)
+    tolerance = np.where(unknown, NOTHING_KNOWN, np.ceil(tolerance))
+    return Backdrop(_blurred(colour), tolerance.astype(np.uint8))
+
+
+def silhouette(image: Image, backdrop: Backdrop, params: SilhouetteParams) -> FrameSilhouette:
+    """Find what stands before the background in one image.
+
+    Where half of the image seems to, the light has changed, and nothing is known.
+
+    Args:
+        image: (H, W, C), from the pose that the backdrop is seen from.
+    """
+    import cv2
+
+    contrast = _largest(cv2.absdiff(_blurred(image), backdrop.colour))
+    known = backdrop.tolerance != NOTHING_KNOWN
+    stands = _without_specks((contrast > backdrop.tolerance) & known, params.min_area)
+    if stands.mean() > params.max_share:
+        known, stands = np.zeros_like(known), np.zeros_like(stands)
+    mask = np.where(known, np.where(stands, FOREGROUND, BACKGROUND), UNKNOWN).astype(np.uint8)
+    mask, scale = _small(mask)
+    left, top, width, height = cv2.boundingRect(stands.view(np.uint8))
+    if not width:
+        return FrameSilhouette(mask, scale, np.zeros((0, 2), np.float32))
+    across = slice(max(left - _PLATEAU_PX, 0), left + width + _PLATEAU_PX)
+    down = slice(max(top - _PLATEAU_PX, 0), top + height + _PLATEAU_PX)
+    contour = _outline(
+        contrast[down, across], stands[down, across], known[down, across],
+        backdrop.tolerance[down, across],
+    )  # fmt: skip
+    corner = np.array([across.start, down.start], dtype=np.float32)
+    return FrameSilhouette(mask, scale, contour + corner)
+
+
+def _small(mask: Image) -> tuple[Image, int]:
+    """Return a mask of at most a fixed width, and its scale; what is foreground stays so."""
+    height, width = mask.shape
+    scale = -(-width // _MASK_WIDTH)
+    rows, columns = height // scale * scale, width // scale * scale
+    small = mask[:rows:scale, :columns:scale]
+    for down in range(scale):
+        for right in range(scale):
+            small = np.maximum(small, mask[down:rows:scale, right:columns:scale])
+    return np.ascontiguousarray(small), scale
+
+
+def _blurred(image: Image) -> Image:
+    import cv2
+
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), _BLUR_PX), np.uint8).reshape(image.shape)
+
+
+def _largest(image: npt.ArrayLike) -> Image:
+    """Return (H, W) the largest channel of an image (H, W, C) or (H, W)."""
+    import cv2
+
+    array = np.asarray(image, dtype=np.uint8)
+    if array.ndim == 2 or array.shape[2] == 1:
+        return array.reshape(array.shape[:2])
+    first, *others = cv2.split(array)
+    for other in others:
+        first = cv2.max(first, other)
+    return np.asarray(first, dtype=np.uint8)
+
+
+def _without_specks(stands: npt.NDArray[np.bool_], least: int) -> npt.NDArray[np.bool_]:
+    import cv2
+
+    _, parts, statistics, _ = cv2.connectedComponentsWithStats(stands.view(np.uint8))
+    large = statistics[:, cv2.CC_STAT_AREA] >= least
+    large[0] = False
+    return np.asarray(np.take(large, parts))
+
+
+def _outline(
+    contrast: Image,
+    stands: npt.NDArray[np.bool_],
+    known: npt.NDArray[np.bool_],
+    tolerance: Image,
+) -> npt.NDArray[np.float32]:
+    """Return (K, 2) points where the contrast falls to half of what it is inside.
+
+    Between two neighbouring pixels, one inside and one outside, the place is interpolated.
+    """
+    import cv2
+
+    square = np.ones((_PLATEAU_PX, _PLATEAU_PX), np.uint8)
+    plateau = np.asarray(cv2.dilate(contrast, square), dtype=np.float32)
+    half = np.maximum(0.5 * plateau, 0.75 * tolerance)
+    inner = np.asarray(cv2.erode(stands.view(np.uint8), square)) > 0
+    inside = (stands & (contrast > half)) | inner
+    closed = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    inside = np.asarray(closed) > 0
+    level = contrast.astype(np.float32)
+    points = []
+    for rows, columns in _NEIGHBOURS:
+        outside = known & ~inside
+        crossing = inside & known & np.roll(outside, (-rows, -columns), axis=(0, 1))
+        crossing[[0, -1]] = crossing[:, [0, -1]] = False
+        v, u = np.nonzero(crossing)
+        here, there = level[v, u], level[v + rows, u + columns]
+        part = np.clip((here - half[v, u]) / np.maximum(here - there, 1e-3), 0.0, 1.0)
+        points.append(np.stack([u + columns * part, v + rows * part], axis=1))
+    return np.concatenate(points).astype(np.float32)

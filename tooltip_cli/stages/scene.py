@@ -1,0 +1,131 @@
+"""The scene behind hand and tool, as every image of a recording sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from tooltip_cli.log.recording import Recording
+from tooltip_cli.log.views import Views
+from tooltip_cli.method.types import Indices
+from tooltip_cli.method.voting.params import SilhouetteParams
+from tooltip_cli.method.voting.silhouette import (
+    NOTHING_KNOWN,
+    Backdrop,
+    FrameSilhouette,
+    Image,
+    learn_backdrop,
+    silhouette,
+)
+from tooltip_cli.rig.camera import CameraModel
+from tooltip_cli.stages.clock import laps
+
+Map = npt.NDArray[np.float32]
+
+_MEMORY = 100_000_000  # bytes that all samples may take together
+_FEWEST_SAMPLES = 9
+_STILL_PX = 0.05  # a camera that turns by less than this is still
+_GRID = (33, 25)  # columns and rows at which a camera's turn is computed, the rest interpolated
+_OUTSIDE = -1e4  # a pixel that no image has
+
+
+class Scene:
+    """The scene without hand and tool, learnt from images all over the recording.
+
+    A camera that turns sees it turned: far things are where its rotation puts them. What its
+    shift does to near things is not known, and shows as pixels that vary.
+    """
+
+    def __init__(
+        self, recording: Recording, views: Views, frames: Indices, params: SilhouetteParams
+    ) -> None:
+        """Learn the scene from some of the frames, image indices.
+
+        Raises:
+            TooltipError: an image cannot be decoded.
+        """
+        self._recording, self._views, self._params = recording, views, params
+        self._reference = views.root_from_camera[frames[len(frames) // 2]]
+        count = int(_MEMORY / (3 * views.camera.width * views.camera.height))
+        count = min(params.samples, max(count, _FEWEST_SAMPLES), len(frames))
+        chosen = frames[np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
+        samples = []
+        for index, image in zip(chosen, recording.images(chosen), strict=True):
+            # pixels of the reference, looked up in this image
+            turn = self._turn(views.root_from_camera[index], self._reference)
+            samples.append(image if turn is None else _looked_up(image, turn))
+        self._backdrop = learn_backdrop(np.stack([_channels(image) for image in samples]), params)
+
+    def silhouettes(self, frames: Indices) -> Iterator[FrameSilhouette]:
+        """Yield what stands before the scene in images, by their indices.
+
+        Raises:
+            TooltipError: an image cannot be decoded.
+        """
+        lap = laps()
+        for index, image in zip(frames, self._recording.images(frames), strict=True):
+            lap("decode")
+            backdrop = self._seen_from(self._views.root_from_camera[index])
+            yield silhouette(_channels(image), backdrop, self._params)
+            lap("silhouettes")
+
+    def _seen_from(self, root_from_camera: npt.NDArray[np.float64]) -> Backdrop:
+        turn = self._turn(self._reference, root_from_camera)
+        if turn is None:
+            return self._backdrop
+        import cv2
+
+        colour = _channels(_looked_up(self._backdrop.colour, turn))
+        tolerance = cv2.remap(
+            self._backdrop.tolerance, turn, None, cv2.INTER_NEAREST, borderValue=NOTHING_KNOWN
+        )
+        return Backdrop(colour, np.asarray(tolerance, dtype=np.uint8))
+
+    def _turn(
+        self, root_from_there: npt.NDArray[np.float64], root_from_here: npt.NDArray[np.float64]
+    ) -> Map | None:
+        """Return (H, W, 2) where each pixel seen from here is in the image from there.
+
+        None: where it is here.
+        """
+        return turn_map(self._views.camera, root_from_there.T @ root_from_here)
+
+
+def turn_map(camera: CameraModel, there_from_here: npt.NDArray[np.float64]) -> Map | None:
+    """Return (H, W, 2) pixels u, v of an image from a turned camera; None: nothing has moved.
+
+    Args:
+        there_from_here: (3, 3) rotation between the camera's two orientations.
+    """
+    columns, rows = _GRID
+    u, v = np.meshgrid(
+        np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
+    )
+    here = np.stack([u, v], axis=-1)
+    there = camera.project(camera.directions(here) @ there_from_here.T)
+    if np.nanmax(np.abs(there - here)) < _STILL_PX:
+        return None
+    coarse = np.nan_to_num(there, nan=_OUTSIDE).astype(np.float32)
+    down, across = _linear(rows, camera.height), _linear(columns, camera.width)
+    return np.stack([down @ coarse[..., axis] @ across.T for axis in (0, 1)], axis=-1)
+
+
+def _linear(count: int, size: int) -> Map:
+    """Return (size, count) weights of so many evenly spread values at each of so many places."""
+    place = np.linspace(0, count - 1, size, dtype=np.float32)
+    return np.asarray(np.maximum(1 - np.abs(place[:, None] - np.arange(count)), 0), np.float32)
+
+
+def _looked_up(image: Image, turn: Map) -> Image:
+    import cv2
+
+    return np.asarray(
+        cv2.remap(image, turn, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8
+    )
+
+
+def _channels(image: Image) -> Image:
+    """Return (H, W, C)."""
+    return image.reshape(*image.shape[:2], -1)
