@@ -176,11 +176,14 @@ def test_what_the_network_lost_or_is_no_cdr_is_counted(router: Router, peer: Any
     states.send(joint_payload(0))
     states.number += 3  # as if three had been sent
     states.send(joint_payload(1))
+    states.publisher.put(
+        joint_payload(2), attachment=b"what an older release attached, of another length"
+    )
     states.send(b"{}")
     wait_for(lambda: len(report.dropped) == 2, "both losses")
     halt.set()
     thread.join()
-    assert taken == [joint_payload(0), joint_payload(1)]
+    assert taken == [joint_payload(0), joint_payload(1), joint_payload(2)]
     assert report.dropped == {
         f"messages on {STATES} that were lost on the way here": 3,
         f"messages on {STATES} that are not plain CDR": 1,

@@ -39,7 +39,7 @@ _TOKEN_PARTS = 13
 _RELIABLE, _TRANSIENT_LOCAL = ("", "1"), "1"  # in a token; reliable is rmw_zenoh's default
 _KEPT = 1000  # messages of a latched topic, at most as many as its publishers keep
 _CDR = (b"\x00\x00", b"\x00\x01")  # plain CDR, big-endian and little-endian
-_NUMBERS = struct.Struct("<qq")
+_ATTACHMENT = struct.Struct("<qqB16s")
 
 
 def _zenoh() -> Any:
@@ -224,9 +224,9 @@ class _TopicReceiver:
             return None
         published_ns = arrival_ns
         attachment = sample.attachment.to_bytes() if sample.attachment is not None else b""
-        if len(attachment) >= _NUMBERS.size:
-            number, published_ns = _NUMBERS.unpack_from(attachment)
-            self._look_for_gap(attachment[_NUMBERS.size :], number)
+        if len(attachment) == _ATTACHMENT.size:  # rmw_zenoh before 0.2.4 wrote another form
+            number, published_ns, _, publisher = _ATTACHMENT.unpack(attachment)
+            self._look_for_gap(publisher, number)
         return Message(
             self._topic.name,
             self._topic.datatype,
