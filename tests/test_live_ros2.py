@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from cyclonedds.domain import DomainParticipant
 
 from tests.helpers import ros2_robot
 from tests.helpers.cli import tooltip
+from tests.helpers.fastdds_robot import has_fastdds, program
 from tests.helpers.recorder import ROOT, by_topic, ended, grown, recorder, wait_for
 from tests.helpers.robot import URDF
 from tests.helpers.ros2_robot import IMAGE, INFO, RAW, ROBOT, STATES, Publisher
@@ -42,8 +44,9 @@ def domain(worker_id: str, monkeypatch: pytest.MonkeyPatch) -> int:
     return 20 * (worker % 9) + next(_NUMBERS)
 
 
-def robot(domain: int, *arguments: object) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "tests.helpers.ros2_robot", str(domain), *map(str, arguments)]
+def robot(domain: int, *arguments: object, kind: str = "ros2") -> subprocess.Popen[str]:
+    module = f"tests.helpers.{kind}_robot"
+    command = [sys.executable, "-m", module, str(domain), *map(str, arguments)]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
 
 
@@ -183,3 +186,24 @@ def test_names_of_types_on_the_wire() -> None:
     assert dds_type_name(messages.JOINT_STATE) == "sensor_msgs::msg::dds_::JointState_"
     assert ros_type_name("sensor_msgs::msg::dds_::JointState_") == messages.JOINT_STATE
     assert ros_type_name("sensor_msgs::srv::dds_::SetCameraInfo_Request_") is None
+
+
+@pytest.mark.skipif(not has_fastdds(), reason="needs Debian's libfastrtps-dev, and g++")
+def test_another_vendors_dds_is_recorded_byte_for_byte(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    program()  # compiled before the time for finding each other runs
+    monkeypatch.setenv("CYCLONEDDS_URI", "<CycloneDDS><Domain/></CycloneDDS>")
+    domain, out = 200 + os.getpid() % 30, tmp_path / "out.mcap"
+    sender = robot(domain, "jpeg", 320, 240, 30, 200, 2.0, kind="fastdds")
+    listener = recorder("ros2", out, "--domain", domain, "--image", IMAGE, "--joints", STATES)
+    sent, _ = sender.communicate(timeout=90)
+    ended(listener, signal.SIGINT)
+    images, joints = map(int, sent.split())
+    found = by_topic(out)
+    assert [m.payload for m in found[IMAGE]] == [
+        on_the_wire(ros2_robot.image_payload("jpeg", 320, 240, i % 30)) for i in range(images)
+    ]
+    assert [m.payload for m in found[STATES]] == [
+        on_the_wire(ros2_robot.joint_payload(i)) for i in range(joints)
+    ]

@@ -49,9 +49,12 @@ class Network:
 
 @contextlib.contextmanager
 def network(transport: str, domain: int = 77) -> Iterator[Network]:
-    """Provide one of :data:`TRANSPORTS`; Zenoh's router and ROS 1's master run meanwhile."""
+    """Provide one of :data:`TRANSPORTS`; Zenoh's router and ROS 1's master run meanwhile.
+
+    ``fastdds`` is ``ros2`` with a robot that uses another DDS than the recorder.
+    """
     module = [sys.executable, "-m", f"tests.helpers.{transport}_robot"]
-    if transport == "ros2":
+    if transport in ("ros2", "fastdds"):
         yield Network(["--domain", str(domain)], [*module, str(domain)])
     elif transport == "zenoh":
         router = Router()

@@ -1,6 +1,6 @@
 """Publish from one process, record in another: what arrives, and at what cost.
 
-python -m tests.benchmarks.live.robot ros2|zenoh|ros1 jpeg|raw 640 480 30 500 60
+python -m tests.benchmarks.live.robot ros2|fastdds|zenoh|ros1 jpeg|raw 640 480 30 500 60
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ def main(transport: str, kind: str, width: str, height: str, fps: str, hz: str, 
     topic = ros2_robot.IMAGE if kind == "jpeg" else ros2_robot.RAW
     names = ["--image", topic, "--joints", ros2_robot.STATES, "--patience", "15"]
     with network(transport) as joined:
-        command = [sys.executable, "-m", "tooltip_cli.cli.main", "record", transport, str(out)]
-        listener = subprocess.Popen([*command, *joined.options, *names])
+        kind_of_recording = "ros2" if transport == "fastdds" else transport
+        command = [sys.executable, "-m", "tooltip_cli.cli.main", "record", kind_of_recording, out]
+        listener = subprocess.Popen([*map(str, command), *joined.options, *names])
         robot = joined.start(kind, width, height, fps, hz, s)
         start = time.monotonic()
         images, joints = map(int, robot.communicate()[0].split())
@@ -52,7 +53,7 @@ def image_of(
     if transport != "ros1":
         made = [ros2_robot.image_payload(kind, width, height, i) for i in range(30)]
         padded = [data + bytes(-len(data) % 4) for data in made]  # DDS sends whole words
-        return lambda number: (padded if transport == "ros2" else made)[number % 30]
+        return lambda number: (padded if transport in ("ros2", "fastdds") else made)[number % 30]
     count = ros1_robot.PICTURES
     pictures = [ros1_robot.picture(kind, width, height, i) for i in range(count)]
 
