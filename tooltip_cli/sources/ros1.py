@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlsplit
 
-from tooltip_cli.errors import MissingExtraError, TooltipError
+from tooltip_cli.errors import TooltipError
 from tooltip_cli.log import messages
 from tooltip_cli.log.messages import Message
 from tooltip_cli.log.qos import latched_qos
@@ -204,8 +204,6 @@ class _TopicReceiver:
         arrival_ns = self._clock.now_ns()
         try:
             converted = cdr_from_ros1(payload, self._topic.datatype)
-        except MissingExtraError:
-            raise
         except Exception:  # the decoder meets arbitrary bytes
             self._report.drop(f"messages on {self._topic.name} that are no {self._topic.datatype}")
             return
