@@ -118,6 +118,25 @@ def test_topics_are_found_with_the_latched_and_the_description(master: str, tmp_
 
 
 @needs_ros1
+def test_a_master_that_is_not_there_yet_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = free_port()
+    monkeypatch.setattr("tests.helpers.robots.free_port", lambda: port)
+    out, uri = tmp_path / "out.mcap", f"http://127.0.0.1:{port}"
+    names = ("--image", IMAGE, "--joints", STATES, "--reconnect")
+    listener = recorder("ros1", out, "--master", uri, *names)
+    time.sleep(2)  # in which nothing answers
+    with ros1_master() as (master, _):
+        assert master == uri
+        robot(master, "jpeg", 64, 48, 30, 100, 1.5).communicate(timeout=90)
+    err = ended(listener, signal.SIGINT)
+    assert err.count("cannot be reached (Connection refused)") == 1
+    assert "; waiting for it" in err
+    assert by_topic(out)[IMAGE]
+
+
+@needs_ros1
 def test_a_node_that_is_killed_and_restarted_is_heard_again(master: str, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     names = ("--image", IMAGE, "--joints", STATES, "--reconnect")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -17,13 +18,14 @@ from tooltip_cli.cli.recording import (
     result_options,
     rig_options,
 )
-from tooltip_cli.errors import TooltipError
+from tooltip_cli.errors import MissingExtraError, TooltipError
 
 if TYPE_CHECKING:
     from tooltip_cli.sources.bus import Bus
 
 _Command = TypeVar("_Command", bound=Callable[..., object])
 TRANSPORTS = ("ros2", "zenoh", "ros1")
+_RETRY_S = 1.0
 
 
 def robot_options(command: _Command) -> _Command:
@@ -240,8 +242,25 @@ def _record_robot(
 
     check_absent(out, overwrite=force)  # before anybody waits for topics
     given, urdf = load_rig_file(rig), load_urdf(robot)
-    bus = open_bus()
+    bus = _joined(open_bus, out, wait=reconnect)
     say(f"{out}: listening on {bus.where}")
     source = RobotSource(bus, Topics(image, joints, info, pose), given, urdf)
     options = LiveOptions(duration, until_enough, reconnect, patience, queue, min_free)
     record_until_end(source, out, options, force, as_json)
+
+
+def _joined(open_bus: Callable[[], Bus], out: Path, *, wait: bool) -> Bus:
+    """Join a network, again and again where that is asked for."""
+    told = False
+    while True:
+        try:
+            return open_bus()
+        except MissingExtraError:
+            raise
+        except TooltipError as error:
+            if not wait:
+                raise
+            if not told:
+                say(f"{out}: {error}; waiting for it")
+            told = True
+        time.sleep(_RETRY_S)
