@@ -13,6 +13,7 @@ Source: rmw_zenoh's design document; its ``liveliness_utils`` and ``attachment_h
 
 from __future__ import annotations
 
+import json
 import os
 import struct
 import threading
@@ -166,11 +167,11 @@ def _configuration(zenoh: Any, router: str | None, config: Path | None) -> Any:
     if config is not None:
         settings = zenoh.Config.from_file(os.fspath(config))
         if router is not None:
-            settings.insert_json5("connect/endpoints", f'["{router}"]')
+            settings.insert_json5("connect/endpoints", json.dumps([router]))
         return settings
     settings = zenoh.Config()
     settings.insert_json5("mode", '"client"')
-    settings.insert_json5("connect/endpoints", f'["{router or ROUTER}"]')
+    settings.insert_json5("connect/endpoints", json.dumps([router or ROUTER]))
     settings.insert_json5("connect/timeout_ms", str(_CONNECT_MS))
     settings.insert_json5("scouting/multicast/enabled", "false")
     return settings
