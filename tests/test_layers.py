@@ -54,6 +54,7 @@ HEAVY = (
     "starlette",
     "trimesh",
     "uvicorn",
+    "zenoh",
 )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -212,6 +213,23 @@ def test_an_mpeg_ts_stream_over_udp(tmp_path: Path) -> None:
     images = messages_in(recording.out, IMAGES)
     assert len(images) > 5
     stamps = [m.log_time_ns for m in images]
+    assert stamps == sorted(set(stamps))
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
+def test_a_stream_of_ffmpeg_is_taken_without_its_backlog(tmp_path: Path) -> None:
+    port = free_port(socket.SOCK_DGRAM)
+    url = f"udp://127.0.0.1:{port}"
+    recording = Recording(tmp_path / "out.mcap", "--camera", url, "--duration", 2)
+    picture = ["-f", "lavfi", "-i", "testsrc=size=160x120:rate=25", "-t", "60"]
+    coded = ["-c:v", "mpeg2video", "-g", "5", "-f", "mpegts", f"{url}?pkt_size=1316"]
+    with subprocess.Popen(["ffmpeg", "-loglevel", "error", "-re", *picture, *coded]) as sender:
+        code, _, err = recording.end()
+        sender.kill()
+    assert code == 0, err
+    stamps = [m.log_time_ns for m in messages_in(recording.out, IMAGES)]
+    # in 2 s at 25 Hz; what waited in the stream while it was opened would come on top, at once
+    assert 10 < len(stamps) < 60
     assert stamps == sorted(set(stamps))
 
 

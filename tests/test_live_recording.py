@@ -22,10 +22,11 @@ from tooltip_cli.log.messages import Message
 from tooltip_cli.log.stopping import Stop
 from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.sources.base import SourceReport
-from tooltip_cli.sources.live import SMALL_BYTES, ArrivalClock, Backlog, Deliver, Receiver
+from tooltip_cli.sources.live import ArrivalClock, Backlog, Deliver, Receiver
 from tooltip_cli.stages.live import METADATA, LiveOptions, Status, record_live
 
 Run = Callable[[Deliver, threading.Event], None]
+_PICTURE = 130_000
 
 
 @dataclass
@@ -68,8 +69,8 @@ def logged(path: Path) -> list[LoggedMessage]:
     return [item for item in iterate(path) if isinstance(item, LoggedMessage)]
 
 
-def big(topic: str = "/big") -> Message:
-    return Message(topic, messages.STRING, 1, bytes(2 * SMALL_BYTES))
+def picture() -> Message:
+    return Message("/big", messages.IMAGE, 1, bytes(_PICTURE))
 
 
 def test_everything_received_before_the_end_is_written(tmp_path: Path) -> None:
@@ -205,8 +206,8 @@ def test_a_disk_that_fills_up_leaves_a_finished_file(
 
 
 @given(
-    st.lists(st.tuples(st.sampled_from(["put", "take"]), st.integers(0, 3 * SMALL_BYTES))),
-    st.integers(1, 10 * SMALL_BYTES),
+    st.lists(st.tuples(st.sampled_from(["put", "take"]), st.integers(0, 200_000))),
+    st.integers(1, 600_000),
 )
 def test_a_backlog_stays_in_its_bounds_and_counts_everything(
     steps: list[tuple[str, int]], limit: int
@@ -228,13 +229,13 @@ def test_a_backlog_stays_in_its_bounds_and_counts_everything(
 
 
 def test_what_is_being_written_still_fills_the_queue() -> None:
-    backlog = Backlog(3 * SMALL_BYTES)
-    backlog.put(big())
+    backlog = Backlog(_PICTURE * 3 // 2)
+    backlog.put(picture())
     (taken,) = backlog.take(0)
-    backlog.put(big())
+    backlog.put(picture())
     assert backlog.counts()[1] == {"/big": 1}
     backlog.written(taken)
-    backlog.put(big())
+    backlog.put(picture())
     assert backlog.counts() == ({"/big": 3}, {"/big": 1})
 
 

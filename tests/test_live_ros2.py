@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -19,13 +20,13 @@ from cyclonedds.domain import DomainParticipant
 
 from tests.helpers import ros2_robot
 from tests.helpers.cli import tooltip
+from tests.helpers.fastdds_robot import has_fastdds, program
+from tests.helpers.recorder import ROOT, by_topic, ended, grown, recorder, wait_for
 from tests.helpers.robot import URDF
 from tests.helpers.ros2_robot import IMAGE, INFO, RAW, ROBOT, STATES, Publisher
 from tooltip_cli.log import messages
-from tooltip_cli.log.container import LoggedMessage, iterate
 from tooltip_cli.sources.dds import dds_type_name, ros_type_name
 
-ROOT = Path(__file__).parents[1]
 _NUMBERS = itertools.count(30)
 LOOPBACK = (
     "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo'/></Interfaces>"
@@ -43,28 +44,15 @@ def domain(worker_id: str, monkeypatch: pytest.MonkeyPatch) -> int:
     return 20 * (worker % 9) + next(_NUMBERS)
 
 
-def robot(domain: int, *arguments: object) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "tests.helpers.ros2_robot", str(domain), *map(str, arguments)]
+def robot(domain: int, *arguments: object, kind: str = "ros2") -> subprocess.Popen[str]:
+    module = f"tests.helpers.{kind}_robot"
+    command = [sys.executable, "-m", module, str(domain), *map(str, arguments)]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-
-
-def recorder(out: Path, domain: int, *arguments: object) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "tooltip_cli.cli.main", "record", "ros2", str(out)]
-    command += ["--domain", str(domain), *map(str, arguments)]
-    return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
 
 
 def on_the_wire(payload: bytes) -> bytes:
     """Return CDR bytes as they are sent, in whole words."""
     return payload + bytes(-len(payload) % 4)
-
-
-def by_topic(path: Path) -> dict[str, list[LoggedMessage]]:
-    found: dict[str, list[LoggedMessage]] = {}
-    for item in iterate(path):
-        if isinstance(item, LoggedMessage):
-            found.setdefault(item.topic, []).append(item)
-    return found
 
 
 @pytest.mark.parametrize(
@@ -76,10 +64,11 @@ def test_every_message_arrives_byte_for_byte(
 ) -> None:
     out = tmp_path / "out.mcap"
     sender = robot(domain, kind, 320, 240, 30, 200, 2.0)
-    listener = recorder(out, domain, "--image", topic, "--joints", STATES, "--patience", 3)
+    listener = recorder(
+        "ros2", out, "--domain", domain, "--image", topic, "--joints", STATES, "--patience", 3
+    )
     sent, _ = sender.communicate(timeout=90)
-    _, err = listener.communicate(timeout=90)
-    assert listener.returncode == 0, err
+    ended(listener)
     images, joints = map(int, sent.split())
     found = by_topic(out)
     assert [m.payload for m in found[topic]] == [
@@ -108,7 +97,7 @@ def test_topics_are_found_and_latched_ones_are_read(domain: int, tmp_path: Path)
         Policy.Durability.TransientLocal,
     )
     described.send(messages.string(URDF))
-    listener = recorder(tmp_path / "out.mcap", domain)
+    listener = recorder("ros2", tmp_path / "out.mcap", "--domain", domain)
     for i in range(3000):
         images.send(ros2_robot.image_payload("jpeg", 32, 24, i))
         states.send(ros2_robot.joint_payload(i))
@@ -116,9 +105,7 @@ def test_topics_are_found_and_latched_ones_are_read(domain: int, tmp_path: Path)
         if images.writer.get_matched_subscriptions() and i % 100 == 99:
             break
     time.sleep(0.5)
-    listener.send_signal(signal.SIGINT)
-    _, err = listener.communicate(timeout=60)
-    assert listener.returncode == 0, err
+    ended(listener, signal.SIGINT)
     found = by_topic(tmp_path / "out.mcap")
     assert set(found) == {IMAGE, STATES, ROBOT}
     assert [m.payload for m in found[ROBOT]] == [on_the_wire(messages.string(URDF))]
@@ -153,21 +140,15 @@ def test_a_publisher_that_is_killed_and_restarted_is_heard_again(
 ) -> None:
     out = tmp_path / "out.mcap"
     options = ("--image", IMAGE, "--joints", STATES, "--reconnect")
-    listener = recorder(out, domain, *options)
+    listener = recorder("ros2", out, "--domain", domain, *options)
     first = robot(domain, "jpeg", 64, 48, 30, 100, 60)
-    unfinished = out.with_name("out.mcap.unfinished")
-    for _ in range(600):
-        if unfinished.exists() and unfinished.stat().st_size > 20_000:
-            break
-        time.sleep(0.1)
+    wait_for(grown(out, 20_000), "a recording")
     first.kill()
     first.communicate()
     time.sleep(2)  # so that the silence is noticed
     second = robot(domain, "jpeg", 64, 48, 30, 100, 1.5)
     second.communicate(timeout=90)
-    listener.send_signal(signal.SIGINT)
-    _, err = listener.communicate(timeout=60)
-    assert listener.returncode == 0, err
+    err = ended(listener, signal.SIGINT)
     payloads = [m.payload for m in by_topic(out)[IMAGE]]
     assert payloads.count(on_the_wire(ros2_robot.image_payload("jpeg", 64, 48, 0))) >= 2
     assert f"nothing on {IMAGE} any more" in err
@@ -176,11 +157,11 @@ def test_a_publisher_that_is_killed_and_restarted_is_heard_again(
 
 def test_list_shows_topics_types_and_rates(domain: int) -> None:
     sender = robot(domain, "jpeg", 64, 48, 20, 100, 4)
-    done = tooltip("record", "list", "--domain", domain, "--json")
+    done = tooltip("record", "list", "--on", "ros2", "--domain", domain, "--json")
     for _ in range(10):  # until the robot is up
         if done.code == 0 and len(json.loads(done.out)) == 4:
             break
-        done = tooltip("record", "list", "--domain", domain, "--json")
+        done = tooltip("record", "list", "--on", "ros2", "--domain", domain, "--json")
     sender.communicate(timeout=90)
     found = {item["topic"]: item for item in json.loads(done.out)}
     assert set(found) == {IMAGE, INFO, STATES, ROBOT}
@@ -189,7 +170,7 @@ def test_list_shows_topics_types_and_rates(domain: int) -> None:
     assert found[ROBOT]["hz"] == 0
 
 
-@pytest.mark.parametrize("command", [("ros2", "out.mcap"), ("list",)])
+@pytest.mark.parametrize("command", [("ros2", "out.mcap"), ("list", "--on", "ros2")])
 def test_without_cyclonedds_the_extra_is_named(
     command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -205,3 +186,24 @@ def test_names_of_types_on_the_wire() -> None:
     assert dds_type_name(messages.JOINT_STATE) == "sensor_msgs::msg::dds_::JointState_"
     assert ros_type_name("sensor_msgs::msg::dds_::JointState_") == messages.JOINT_STATE
     assert ros_type_name("sensor_msgs::srv::dds_::SetCameraInfo_Request_") is None
+
+
+@pytest.mark.skipif(not has_fastdds(), reason="needs Debian's libfastrtps-dev, and g++")
+def test_another_vendors_dds_is_recorded_byte_for_byte(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    program()  # compiled before the time for finding each other runs
+    monkeypatch.setenv("CYCLONEDDS_URI", "<CycloneDDS><Domain/></CycloneDDS>")
+    domain, out = 200 + os.getpid() % 30, tmp_path / "out.mcap"
+    sender = robot(domain, "jpeg", 320, 240, 30, 200, 2.0, kind="fastdds")
+    listener = recorder("ros2", out, "--domain", domain, "--image", IMAGE, "--joints", STATES)
+    sent, _ = sender.communicate(timeout=90)
+    ended(listener, signal.SIGINT)
+    images, joints = map(int, sent.split())
+    found = by_topic(out)
+    assert [m.payload for m in found[IMAGE]] == [
+        on_the_wire(ros2_robot.image_payload("jpeg", 320, 240, i % 30)) for i in range(images)
+    ]
+    assert [m.payload for m in found[STATES]] == [
+        on_the_wire(ros2_robot.joint_payload(i)) for i in range(joints)
+    ]

@@ -15,6 +15,7 @@ from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 
+from tests.helpers.pacing import pace, play_file
 from tests.helpers.robot import CAMERA, CAMERA_FRAME, JOINTS, URDF
 from tooltip_cli.log import messages
 from tooltip_cli.sources.dds import dds_type
@@ -85,22 +86,25 @@ def main(domain: int, kind: str, width: int, height: int, fps: float, hz: float,
             raise SystemExit("nobody listens")
         time.sleep(0.01)
     time.sleep(0.5)  # the other side knows of it a little later
-    start, image, joint = time.monotonic(), 0, 0
-    while (now := time.monotonic() - start) < s:
-        if now * fps >= image:
-            infos.send(messages.camera_info(START_NS + image * 10**7, CAMERA_FRAME, CAMERA))
-            images.send(payloads[image % len(payloads)])
-            image += 1
-        if now * hz >= joint:
-            states.send(joint_payload(joint))
-            joint += 1
-        ahead = min(image / fps, joint / hz) - (time.monotonic() - start)
-        if ahead > 0:
-            time.sleep(ahead)
-    print(image, joint, flush=True)
+
+    def image(number: int) -> None:
+        infos.send(messages.camera_info(START_NS + number * 10**7, CAMERA_FRAME, CAMERA))
+        images.send(payloads[number % len(payloads)])
+
+    print(*pace(fps, hz, s, image, lambda number: states.send(joint_payload(number))), flush=True)
     time.sleep(1.0)  # what is on its way still arrives
 
 
+def play(domain: int, path: str) -> None:
+    """Publish the messages of a file; see tests.helpers.pacing."""
+    participant = DomainParticipant(domain)
+    reliable = (Policy.Reliability.Reliable(10**9), Policy.History.KeepLast(100))
+    play_file(path, lambda name, kind: Publisher(participant, name, kind, *reliable).send)
+
+
 if __name__ == "__main__":
-    domain, kind, width, height, fps, hz, seconds = sys.argv[1:]
-    main(int(domain), kind, int(width), int(height), float(fps), float(hz), float(seconds))
+    if sys.argv[2] == "play":
+        play(int(sys.argv[1]), sys.argv[3])
+    else:
+        domain, kind, width, height, fps, hz, seconds = sys.argv[1:]
+        main(int(domain), kind, int(width), int(height), float(fps), float(hz), float(seconds))

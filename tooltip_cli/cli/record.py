@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tooltip_cli.cli.options import PATH, jobs_option, progress, say, topic_options
-from tooltip_cli.cli.record_live import camera, list_, ros2
+from tooltip_cli.cli.record_live import camera
+from tooltip_cli.cli.record_robot import list_, ros1, ros2, zenoh
 from tooltip_cli.cli.recording import (
     finish,
     load_rig_file,
@@ -41,11 +42,15 @@ def record() -> None:
       tooltip record video pliers.mp4 pliers.mcap --joints joints.csv --rig rig.yaml
       tooltip record camera pliers.mcap --camera 0 --joints udp://:9870 --rig rig.yaml
       tooltip record ros2 pliers.mcap --duration 15 --rig rig.yaml
+      tooltip record zenoh pliers.mcap --router tcp/robot:7447 --rig rig.yaml
+      tooltip record ros1 pliers.mcap --master http://robot:11311 --rig rig.yaml
     """
 
 
 record.add_command(camera)
 record.add_command(ros2)
+record.add_command(zenoh)
+record.add_command(ros1)
 record.add_command(list_)
 
 

@@ -1,4 +1,4 @@
-"""``tooltip record`` from robots and cameras that send by themselves."""
+"""``tooltip record camera``, and what recordings of things that send by themselves share."""
 
 from __future__ import annotations
 
@@ -10,12 +10,8 @@ import click
 
 from tooltip_cli.cli.options import (
     StatusLine,
-    json_option,
-    print_json,
     say,
     size_in_bytes,
-    table,
-    topic_options,
 )
 from tooltip_cli.cli.recording import (
     finish,
@@ -93,8 +89,8 @@ def camera_options(command: _Command) -> _Command:
         click.option(
             "--joints",
             metavar="SOURCE",
-            help="udp://HOST:PORT or tcp://HOST:PORT with JSON lines, a CSV file that grows, or a "
-            "Python object module:factory.",
+            help="udp://HOST:PORT or tcp://HOST:PORT with JSON lines, rtde://HOST of a UR robot, a "
+            "CSV file that grows, or a Python object module:factory.",
         ),
         click.option(
             "--camera",
@@ -121,35 +117,6 @@ def camera_source(
         rig=load_rig_file(rig),
         urdf=load_urdf(robot),
     )
-
-
-domain_option = click.option(
-    "--domain",
-    type=click.IntRange(0, 232),
-    default=0,
-    show_default=True,
-    envvar="ROS_DOMAIN_ID",
-    show_envvar=True,
-    metavar="N",
-    help="DDS domain of the robot.",
-)
-
-
-def ros2_source(
-    image: str | None,
-    joints: str | None,
-    info: str | None,
-    pose: str | None,
-    domain: int,
-    rig: Path | None,
-    robot: Path | None,
-) -> LiveSource:
-    """Return the source that ``topic_options``, ``domain_option`` and ``rig_options`` name."""
-    from tooltip_cli.log.recording import Topics
-    from tooltip_cli.sources.ros2 import Ros2Source
-
-    topics = Topics(image, joints, info, pose)
-    return Ros2Source(domain, topics, load_rig_file(rig), load_urdf(robot))
 
 
 @click.command("camera", short_help="Record a camera and joints without ROS.")
@@ -187,91 +154,20 @@ def camera(
     Examples:
       tooltip record camera pliers.mcap --camera 0 --joints udp://:9870 --rig rig.yaml
       tooltip record camera pliers.mcap --camera http://head/stream --joints tcp://robot:9870
+      tooltip record camera pliers.mcap --camera /dev/video2 --joints rtde://192.168.0.10
       tooltip record camera pliers.mcap --camera rtsp://head/live --joints arm:joints --duration 15
     """
     from tooltip_cli.stages.live import LiveOptions
 
     source = camera_source(camera, joints, joint_stamps, rig, robot)
     options = LiveOptions(duration, until_enough, reconnect, patience, queue, min_free)
-    _record(source, out, options, force, as_json)
+    record_until_end(source, out, options, force, as_json)
 
 
-@click.command("ros2", short_help="Record a ROS 2 robot, without ROS.")
-@out_argument
-@topic_options
-@domain_option
-@live_options
-@rig_options
-@result_options
-def ros2(
-    out: Path,
-    image: str | None,
-    joints: str | None,
-    info: str | None,
-    pose: str | None,
-    domain: int,
-    duration: float | None,
-    until_enough: bool,
-    reconnect: bool,
-    patience: float,
-    queue: int,
-    rig: Path | None,
-    robot: Path | None,
-    min_free: int,
-    force: bool,
-    as_json: bool,
-) -> None:
-    """Record images, intrinsics, joints and robot description of a ROS 2 robot over DDS.
-
-    No ROS is needed on this machine. Messages are stored byte for byte, with the time of their
-    arrival and that of their publication. A topic that is named may begin later; of the others,
-    the only one of its type that is heard within three seconds is taken.
-
-    \b
-    Examples:
-      tooltip record ros2 pliers.mcap --duration 15 --rig rig.yaml
-      tooltip record ros2 pliers.mcap --image /head/image_raw/compressed --domain 7
-    """
-    from tooltip_cli.stages.live import LiveOptions
-
-    source = ros2_source(image, joints, info, pose, domain, rig, robot)
-    options = LiveOptions(duration, until_enough, reconnect, patience, queue, min_free)
-    _record(source, out, options, force, as_json)
-
-
-@click.command("list", short_help="Show what can be heard.")
-@domain_option
-@json_option
-def list_(domain: int, as_json: bool) -> None:
-    """Show the topics of a ROS 2 robot: names, types, rates.
-
-    Rates are measured over two seconds, for the types that a recording can hold.
-
-    \b
-    Examples:
-      tooltip record list
-      tooltip record list --domain 7 --json
-    """
-    from tooltip_cli.sources.dds import topic_rates
-
-    found = topic_rates(domain, 2.0)
-    if as_json:
-        print_json(
-            [{"topic": item.name, "type": item.datatype, "hz": rate} for item, rate in found]
-        )
-        return
-    if not found:
-        say(f"DDS domain {domain}: nothing is heard; is ROS_DOMAIN_ID the robot's?")
-    rows = [
-        (item.name, item.datatype, "-" if rate is None else f"{rate:.1f}") for item, rate in found
-    ]
-    for line in table(("topic", "type", "Hz"), rows, 2) if rows else ():
-        click.echo(line)
-
-
-def _record(
+def record_until_end(
     source: LiveSource, out: Path, options: LiveOptions, force: bool, as_json: bool
 ) -> None:
+    """Record, with the line that says how it stands, and print the result."""
     from tooltip_cli.log.stopping import stop_on_signals
     from tooltip_cli.stages.live import record_live
     from tooltip_cli.stages.watching import MotionObserver

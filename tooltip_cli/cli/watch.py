@@ -22,15 +22,20 @@ from tooltip_cli.cli.options import (
 from tooltip_cli.cli.record_live import (
     camera_options,
     camera_source,
-    domain_option,
     duration_option,
     patience_option,
     reconnect_option,
-    ros2_source,
+)
+from tooltip_cli.cli.record_robot import (
+    domain_option,
+    master_option,
+    robot_source,
+    zenoh_options,
 )
 
 if TYPE_CHECKING:
     from tooltip_cli.method.voting.params import VotingSettings
+    from tooltip_cli.sources.bus import Bus
     from tooltip_cli.sources.live import LiveSource
     from tooltip_cli.stages.watch import Counts, Update, WatchOptions, WatchStatus
 
@@ -226,18 +231,80 @@ def camera(
     )
 
 
-@watch.command("ros2", short_help="A ROS 2 robot, without ROS.")
+@watch.command("ros2", short_help="A ROS 2 robot over DDS, without ROS.")
 @topic_options
 @domain_option
 @_live_options
 @click.pass_context
-def ros2(
+def ros2(ctx: click.Context, /, domain: int, **options: Any) -> None:
+    """Estimate the tip from the images and joints of a ROS 2 robot, over DDS.
+
+    Topics are chosen as by 'tooltip record ros2'. Nothing is recorded.
+
+    \b
+    Example:
+      tooltip watch ros2 --domain 7 --rig rig.yaml --until-enough
+    """
+    from tooltip_cli.sources.dds import DdsBus
+
+    _watch_robot(ctx, "ros2", lambda: DdsBus(domain), **options)
+
+
+@watch.command("zenoh", short_help="A ROS 2 robot over Zenoh, without ROS.")
+@topic_options
+@domain_option
+@zenoh_options
+@_live_options
+@click.pass_context
+def zenoh(
     ctx: click.Context,
+    /,
+    domain: int,
+    router: str | None,
+    zenoh_config: Path | None,
+    **options: Any,
+) -> None:
+    """Estimate the tip from the images and joints of a robot that runs rmw_zenoh.
+
+    Topics are chosen as by 'tooltip record zenoh'. Nothing is recorded.
+
+    \b
+    Example:
+      tooltip watch zenoh --router tcp/robot:7447 --rig rig.yaml
+    """
+    from tooltip_cli.sources.zenoh_bus import ZenohBus
+
+    _watch_robot(ctx, "zenoh", lambda: ZenohBus(domain, router, zenoh_config), **options)
+
+
+@watch.command("ros1", short_help="A ROS 1 robot, without ROS.")
+@topic_options
+@master_option
+@_live_options
+@click.pass_context
+def ros1(ctx: click.Context, /, master: str, **options: Any) -> None:
+    """Estimate the tip from the images and joints of a ROS 1 robot.
+
+    Topics are chosen as by 'tooltip record ros1'. Nothing is recorded.
+
+    \b
+    Example:
+      tooltip watch ros1 --master http://robot:11311 --rig rig.yaml
+    """
+    from tooltip_cli.sources.ros1 import Ros1Bus
+
+    _watch_robot(ctx, "ros1", lambda: Ros1Bus(master), **options)
+
+
+def _watch_robot(
+    ctx: click.Context,
+    name: str,
+    open_bus: Callable[[], Bus],
+    *,
     image: str | None,
     joints: str | None,
     info: str | None,
     pose: str | None,
-    domain: int,
     rig: Path,
     robot: Path | None,
     duration: float | None,
@@ -250,19 +317,13 @@ def ros2(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Estimate the tip from the images and joints of a ROS 2 robot, over DDS.
+    from tooltip_cli.log.recording import Topics
 
-    Topics are chosen as by 'tooltip record ros2'. Nothing is recorded.
-
-    \b
-    Example:
-      tooltip watch ros2 --domain 7 --rig rig.yaml --until-enough
-    """
-    source = ros2_source(image, joints, info, pose, domain, rig, robot)
+    topics = Topics(image, joints, info, pose)
+    source = robot_source(open_bus, name, topics, rig, robot, wait=reconnect)
     limits = (every, until_enough, duration)
-    _run(
-        ctx, "ros2", "ros2", _live(source, reconnect, patience), limits, prefer, out, force, as_json
-    )
+    run = _live(source, reconnect, patience)
+    _run(ctx, name, name, run, limits, prefer, out, force, as_json)
 
 
 _Result = tuple["Update", dict[str, Any]]

@@ -62,7 +62,9 @@ class McapFile:
         self._compressor = zstandard.ZstdCompressor(level=_LEVEL)
         self._waiting: list[_Waiting] = []
         self._waiting_bytes = 0
-        self._chunk_indexes: list[ChunkIndex] = []
+        self._chunk_indexes = bytearray()  # as records, a tenth of what objects take
+        self._chunks = 0
+        self._times: list[int] = []  # the first and the last log time
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}  # messages in the file, by channel
@@ -150,19 +152,20 @@ class McapFile:
         self._waiting_bytes = sum(len(head) + len(payload) for *_, head, payload in self._waiting)
         for channel, pairs in entries.items():
             self._counts[channel] = self._counts.get(channel, 0) + len(pairs)
-        self._chunk_indexes.append(
-            ChunkIndex(
-                chunk_length=len(head) + len(packed),
-                chunk_start_offset=start,
-                compression=_COMPRESSION,
-                compressed_size=len(packed),
-                message_end_time=max(times),
-                message_index_length=len(indexes),
-                message_index_offsets=offsets,
-                message_start_time=min(times),
-                uncompressed_size=len(records),
-            )
+        index = ChunkIndex(
+            chunk_length=len(head) + len(packed),
+            chunk_start_offset=start,
+            compression=_COMPRESSION,
+            compressed_size=len(packed),
+            message_end_time=max(times),
+            message_index_length=len(indexes),
+            message_index_offsets=offsets,
+            message_start_time=min(times),
+            uncompressed_size=len(records),
         )
+        self._chunk_indexes += _packed(index)
+        self._chunks += 1
+        self._times = [min(times + self._times), max(times + self._times)]
 
     def drop_waiting(self) -> None:
         """Give up the messages that wait, where no room is left for them."""
@@ -224,7 +227,7 @@ class McapFile:
             (Opcode.SCHEMA, [self._schemas[number] for number in sorted(used - {0})]),
             (Opcode.CHANNEL, [self._channels[number][1] for number in sorted(self._counts)]),
             (Opcode.STATISTICS, [_packed(self._statistics(len(used - {0})))]),
-            (Opcode.CHUNK_INDEX, [_packed(item) for item in self._chunk_indexes]),
+            (Opcode.CHUNK_INDEX, [bytes(self._chunk_indexes)]),
             (Opcode.ATTACHMENT_INDEX, [_packed(item) for item in self._attachment_indexes]),
             (Opcode.METADATA_INDEX, [_packed(item) for item in self._metadata_indexes]),
         ]
@@ -241,11 +244,11 @@ class McapFile:
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self._counts),
             channel_message_counts=dict(self._counts),
-            chunk_count=len(self._chunk_indexes),
+            chunk_count=self._chunks,
             message_count=sum(self._counts.values()),
             metadata_count=len(self._metadata_indexes),
-            message_start_time=min((i.message_start_time for i in self._chunk_indexes), default=0),
-            message_end_time=max((i.message_end_time for i in self._chunk_indexes), default=0),
+            message_start_time=min(self._times, default=0),
+            message_end_time=max(self._times, default=0),
             schema_count=schemas,
         )
 

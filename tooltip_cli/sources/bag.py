@@ -12,8 +12,9 @@ from tooltip_cli.log.messages import Message
 from tooltip_cli.log.recording import IMAGE_TYPES, Topics
 from tooltip_cli.log.topics import choose_info, choose_topic, info_siblings
 from tooltip_cli.rig.rigfile import Rig
-from tooltip_cli.sources.bagfiles import StoredMessage, StoredTopic, cdr_from_ros1, open_bag
+from tooltip_cli.sources.bagfiles import StoredMessage, StoredTopic, open_bag
 from tooltip_cli.sources.base import SourceReport
+from tooltip_cli.sources.ros1types import cdr_from_ros1
 from tooltip_cli.sources.streams import image_kind, plural, robot_message, with_robot
 
 _ENCODINGS = ("cdr", "ros1")

@@ -20,6 +20,7 @@ from tooltip_cli.log.mcapfile import MAGIC
 from tooltip_cli.log.qos import known_qos, latched_qos, qos_of_profiles
 from tooltip_cli.log.records import MAX_RECORD_BYTES, unpack_zstd
 from tooltip_cli.rig.documents import parse_yaml
+from tooltip_cli.sources.ros1types import definition_sum, ros2_name
 from tooltip_cli.sources.streams import missing_extra, one_line
 
 if TYPE_CHECKING:
@@ -227,39 +228,14 @@ class Ros1Bag:
         return Reader(self._path)
 
 
-def cdr_from_ros1(payload: bytes, datatype: str) -> bytes:
-    """Return a serialised ROS 1 message as ROS 2 CDR.
-
-    The types that a recording keeps differ between ROS 1 and 2 only in the header's ``seq``,
-    which the conversion leaves out.
-
-    Raises:
-        Exception: whatever ``rosbags`` meets in bytes that are not such a message.
-    """
-    return bytes(_typestore("ROS2_HUMBLE").ros1_to_cdr(payload, datatype))
-
-
 def _check_definition(topic: str, datatype: str, digest: str, path: Path) -> None:
-    expected = _typestore("ROS1_NOETIC").generate_msgdef(datatype)[1]
+    expected = definition_sum(datatype)
     # writers that copy unknown types note the sum as "*"
     if digest not in (expected, "*", ""):
         raise TooltipError(
             f"{path}: {datatype} on {topic} has another definition (MD5 {digest}) than in ROS 1 "
             f"({expected}) and cannot be converted"
         )
-
-
-def _typestore(name: str) -> Any:
-    try:
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise missing_extra(FEATURE, EXTRA, error) from error
-    if name not in _TYPESTORES:
-        _TYPESTORES[name] = get_typestore(Stores[name])
-    return _TYPESTORES[name]
-
-
-_TYPESTORES: dict[str, Any] = {}
 
 
 def _merge(known: StoredTopic | None, found: StoredTopic) -> StoredTopic:
@@ -273,12 +249,6 @@ def _merge(known: StoredTopic | None, found: StoredTopic) -> StoredTopic:
     )
 
 
-def _ros2_name(datatype: str) -> str:
-    """Return ``pkg/msg/Name`` for it or for the ROS 1 form ``pkg/Name``."""
-    parts = datatype.split("/")
-    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else datatype
-
-
 def _mcap_topics(plain: Path, path: Path) -> Iterator[tuple[str, StoredTopic]]:
     summary = _mcap_summary(plain)
     if summary is not None:
@@ -287,7 +257,7 @@ def _mcap_topics(plain: Path, path: Path) -> Iterator[tuple[str, StoredTopic]]:
     for item in iterate(plain):
         if isinstance(item, LoggedMessage):
             qos = known_qos(item.channel.metadata.get(_QOS, ""))
-            yield item.topic, StoredTopic(_ros2_name(item.datatype), item.encoding, 1, qos)
+            yield item.topic, StoredTopic(ros2_name(item.datatype), item.encoding, 1, qos)
 
 
 def _mcap_summary(plain: Path) -> list[tuple[str, StoredTopic]] | None:
@@ -307,7 +277,7 @@ def _mcap_summary(plain: Path) -> list[tuple[str, StoredTopic]] | None:
         schema = summary.schemas.get(channel.schema_id) if channel is not None else None
         if channel is None or (schema is None and channel.schema_id):
             return None
-        datatype = _ros2_name(schema.name) if schema is not None else ""
+        datatype = ros2_name(schema.name) if schema is not None else ""
         qos = known_qos(channel.metadata.get(_QOS, ""))
         topics.append((channel.topic, StoredTopic(datatype, channel.message_encoding, count, qos)))
     return topics
@@ -324,7 +294,7 @@ def _sqlite_topics(plain: Path, path: Path) -> Iterator[tuple[str, StoredTopic]]
         for item in reader.connections:
             encoding = str(getattr(item.ext, "serialization_format", ""))
             qos = qos_of_profiles(getattr(item.ext, "offered_qos_profiles", None) or [])
-            yield item.topic, StoredTopic(_ros2_name(item.msgtype), encoding, item.msgcount, qos)
+            yield item.topic, StoredTopic(ros2_name(item.msgtype), encoding, item.msgcount, qos)
 
 
 def _sqlite_messages(plain: Path, path: Path, wanted: Collection[str]) -> Iterator[StoredMessage]:

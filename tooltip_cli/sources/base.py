@@ -22,9 +22,9 @@ class SourceReport:
         """Count one message that was read."""
         self.read[topic] = self.read.get(topic, 0) + 1
 
-    def drop(self, reason: str) -> None:
-        """Count one message that was left out."""
-        self.dropped[reason] = self.dropped.get(reason, 0) + 1
+    def drop(self, reason: str, count: int = 1) -> None:
+        """Count messages that were left out."""
+        self.dropped[reason] = self.dropped.get(reason, 0) + count
 
 
 class Source(Protocol):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import http.client
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -20,6 +21,8 @@ _MAX_IMAGE_BYTES = 1 << 25
 _MAX_LINE = 1 << 16
 _END_OF_IMAGE = b"\xff\xd9"  # of JPEG
 _LOST_READS = 50  # in a row without a frame
+_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+_AT_ONCE = "fflags;nobuffer|flags;low_delay"
 
 Frame = tuple[int, str, bytes]  # arrival, nanoseconds; jpeg or png; data
 
@@ -180,6 +183,8 @@ def _captured(spec: str, clock: ArrivalClock, halt: threading.Event) -> Iterator
 
 
 def _open(cv2: Any, spec: str) -> Any:
+    # else what came during the first look at a stream is delivered late; the user's own wins
+    os.environ.setdefault(_OPTIONS, _AT_ONCE)
     if spec.isdecimal():
         capture = cv2.VideoCapture(int(spec))
     else:

@@ -13,30 +13,22 @@ import functools
 import os
 import threading
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.log import messages
 from tooltip_cli.log.messages import Message
-from tooltip_cli.log.recording import IMAGE_TYPES
-from tooltip_cli.sources.live import ArrivalClock, Deliver
+from tooltip_cli.sources.base import SourceReport
+from tooltip_cli.sources.bus import SETTLED_S, HeardTopic
+from tooltip_cli.sources.live import ArrivalClock, Deliver, Receiver
 from tooltip_cli.sources.streams import missing_extra
 
 FEATURE, EXTRA = "record ros2", "ros2"
-DISCOVERY_S = 3.0
 _POLL_S = 0.25  # longest sleep between looks at whether to stop
-_SETTLED_S = 1.0  # without a new topic, discovery is over
 _DEPTH = 200  # samples that wait in the middleware: 0.4 s at 500 Hz
 _TAKE = 64
-RECORDED_TYPES = (
-    *IMAGE_TYPES,
-    messages.CAMERA_INFO,
-    messages.JOINT_STATE,
-    messages.POSE_STAMPED,
-    messages.STRING,
-)
 _ROOM = (
     "<CycloneDDS><Domain><Internal><SocketReceiveBufferSize max='16MB'/></Internal></Domain>"
     "</CycloneDDS>"
@@ -49,16 +41,6 @@ _PRIMITIVES = {
     "float32": "float32",
     "float64": "float64",
 }
-
-
-@dataclass(frozen=True)
-class HeardTopic:
-    """A topic that somebody publishes."""
-
-    name: str  # as ROS names it
-    datatype: str  # as ROS names it
-    latched: bool  # every publisher keeps its last messages for late subscribers
-    reliable: bool
 
 
 class _Sample:
@@ -148,31 +130,6 @@ def _keep(cls: Any, data: bytes, *arguments: Any, **options: Any) -> _Sample:
     return _Sample(data)
 
 
-def heard_topics(participant: Any, wait_s: float, halt: threading.Event) -> list[HeardTopic]:
-    """Return what is published in a domain, by name; ends early once nothing new turns up."""
-    dds = _dds()
-    reader = dds.builtin.BuiltinDataReader(participant, dds.builtin.BuiltinTopicDcpsPublication)
-    found: dict[tuple[str, str], HeardTopic] = {}
-    start = latest = time.monotonic()
-    while not halt.is_set():
-        for endpoint in reader.take(_TAKE):
-            topic = _heard(dds, endpoint) if endpoint.sample_info.valid_data else None
-            if topic is not None:
-                key = topic.name, topic.datatype
-                before = found.get(key, topic)
-                found[key] = replace(
-                    topic,
-                    latched=topic.latched and before.latched,
-                    reliable=topic.reliable and before.reliable,
-                )
-                latest = time.monotonic()
-        now = time.monotonic()
-        if now - start > wait_s or (found and now - latest > _SETTLED_S):
-            break
-        halt.wait(0.02)
-    return sorted(found.values(), key=lambda topic: (topic.name, topic.datatype))
-
-
 def _heard(dds: Any, endpoint: Any) -> HeardTopic | None:
     datatype = ros_type_name(endpoint.type_name)
     if not endpoint.topic_name.startswith("rt/") or datatype is None:
@@ -195,26 +152,79 @@ def _room_for_images() -> None:
         os.environ["CYCLONEDDS_URI"] = f"{_ROOM},{settings}".rstrip(",")
 
 
-def open_domain(domain: int) -> Any:
-    """Join a DDS domain.
+class DdsBus:
+    """The topics of a DDS domain.
+
+    Args:
+        domain: ``ROS_DOMAIN_ID`` of the robot.
 
     Raises:
         MissingExtraError: cyclonedds is not installed.
         TooltipError: the domain cannot be joined.
     """
-    dds = _dds()
-    # ahead of the user's own settings, which win; the system may grant less (net.core.rmem_max)
-    _room_for_images()
-    try:
-        return dds.domain.DomainParticipant(domain)
-    except dds.core.DDSException as error:
-        raise TooltipError(
-            f"DDS domain {domain} cannot be joined ({' '.join(str(error).split())}); check the "
-            "network and CYCLONEDDS_URI"
-        ) from error
+
+    def __init__(self, domain: int) -> None:
+        dds = _dds()
+        self._domain = domain
+        # ahead of the user's own settings, which win; the system may grant less
+        # (net.core.rmem_max)
+        _room_for_images()
+        try:
+            self._participant = dds.domain.DomainParticipant(domain)
+        except dds.core.DDSException as error:
+            raise TooltipError(
+                f"{self.where} cannot be joined ({' '.join(str(error).split())}); check the "
+                "network and CYCLONEDDS_URI"
+            ) from error
+
+    @property
+    def where(self) -> str:
+        """The domain."""
+        return f"DDS domain {self._domain}"
+
+    def heard(self, wait_s: float) -> list[HeardTopic]:
+        """Return what is published in the domain."""
+        dds = _dds()
+        reader = dds.builtin.BuiltinDataReader(
+            self._participant, dds.builtin.BuiltinTopicDcpsPublication
+        )
+        found: dict[tuple[str, str], HeardTopic] = {}
+        start = latest = time.monotonic()
+        while True:
+            for endpoint in reader.take(_TAKE):
+                topic = _heard(dds, endpoint) if endpoint.sample_info.valid_data else None
+                if topic is not None:
+                    key = topic.name, topic.datatype
+                    before = found.get(key, topic)
+                    found[key] = replace(
+                        topic,
+                        latched=topic.latched and before.latched,
+                        reliable=topic.reliable and before.reliable,
+                    )
+                    latest = time.monotonic()
+            now = time.monotonic()
+            if now - start > wait_s or (found and now - latest > SETTLED_S):
+                break
+            time.sleep(0.02)
+        return sorted(found.values(), key=lambda topic: (topic.name, topic.datatype))
+
+    def receiver(self, topic: HeardTopic, clock: ArrivalClock, report: SourceReport) -> Receiver:
+        """Return what takes a topic's samples as bytes."""
+        return _TopicReceiver(self._participant, topic, clock)
+
+    def robot_description(self) -> str | None:
+        """Return None: the robot's description is a topic."""
+        return None
+
+    def metadata(self) -> Mapping[str, str]:
+        """Return the domain and where its times come from."""
+        return {
+            "publish_time": "the DDS source timestamp, of the publisher's machine",
+            "ros_domain_id": str(self._domain),
+        }
 
 
-class TopicReceiver:
+class _TopicReceiver:
     """Takes the samples of one topic as bytes."""
 
     def __init__(self, participant: Any, topic: HeardTopic, clock: ArrivalClock) -> None:
@@ -257,38 +267,3 @@ class TopicReceiver:
             sample.payload,
             published_ns if published_ns > 0 else arrival_ns,
         )
-
-
-def topic_rates(domain: int, listen_s: float) -> list[tuple[HeardTopic, float | None]]:
-    """Return what is published in a domain, with messages a second where the type is known.
-
-    Raises:
-        MissingExtraError: cyclonedds is not installed.
-        TooltipError: the domain cannot be joined.
-    """
-    participant, halt, clock = open_domain(domain), threading.Event(), ArrivalClock()
-    heard = heard_topics(participant, DISCOVERY_S, halt)
-    arrivals: dict[str, list[int]] = {}
-
-    def count(message: Message) -> None:
-        arrivals.setdefault(message.topic, []).append(message.log_time_ns)
-
-    known = [topic for topic in heard if topic.datatype in RECORDED_TYPES]
-    threads = [
-        threading.Thread(target=TopicReceiver(participant, topic, clock).run, args=(count, halt))
-        for topic in known
-    ]
-    for thread in threads:
-        thread.start()
-    halt.wait(listen_s)
-    halt.set()
-    for thread in threads:
-        thread.join()
-    return [
-        (topic, _rate(arrivals.get(topic.name, [])) if topic in known else None) for topic in heard
-    ]
-
-
-def _rate(arrivals_ns: Sequence[int]) -> float:
-    spans = len(arrivals_ns) - 1
-    return spans * 1e9 / max(arrivals_ns[-1] - arrivals_ns[0], 1) if spans > 0 else 0.0

@@ -1,4 +1,4 @@
-"""Joint angles as they come: a UDP or TCP socket, a CSV file that grows, a Python object.
+"""Joint angles as they come: a socket, a UR robot, a CSV file that grows, a Python object.
 
 A line on a socket is a JSON object, one a datagram for UDP::
 
@@ -26,6 +26,7 @@ from urllib.parse import urlsplit
 
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.rig.documents import shown
+from tooltip_cli.sources import rtde
 from tooltip_cli.sources.streams import check_stamp, one_line
 
 _POLL_S = 0.2  # between looks at whether to stop
@@ -66,7 +67,9 @@ Samples = Callable[[threading.Event], Iterator["JointSample | str"]]
 
 
 def joint_samples(spec: str) -> Samples:
-    """Return what listens to ``udp://HOST:PORT``, ``tcp://HOST:PORT``, a CSV, ``module:factory``.
+    """Return what listens to a source of joints, by how its name begins or ends.
+
+    It is ``udp://HOST:PORT``, ``tcp://HOST:PORT``, ``rtde://HOST``, a CSV or ``module:factory``.
 
     Raises:
         TooltipError: it is none of them.
@@ -74,16 +77,24 @@ def joint_samples(spec: str) -> Samples:
     scheme = spec.partition("://")[0]
     if scheme in ("udp", "tcp"):
         host, port = _address(spec)
+        if not port:
+            raise TooltipError(f"{spec}: no port; expected e.g. udp://:9870 or tcp://robot:9870")
+        place = host, port
         receive = _udp if scheme == "udp" else _tcp
-        return lambda halt: _parsed(receive(spec, host, port, halt))
+        return lambda halt: _parsed(receive(spec, place, halt))
+    if scheme == "rtde":
+        host, port = _address(spec)
+        if not host:
+            raise TooltipError(f"{spec}: no robot; expected e.g. rtde://192.168.0.10")
+        return lambda halt: _arm(spec, host, port or rtde.PORT, halt)
     if spec.lower().endswith(".csv"):
         return lambda halt: _grown(Path(spec), halt)
     module, colon, name = spec.partition(":")
     if colon and module and name.isidentifier():
         return lambda halt: _called(spec, module, name, halt)
     raise TooltipError(
-        f"{shown(spec)} is no source of joints; expected udp://HOST:PORT, tcp://HOST:PORT, a .csv "
-        "file that grows, or module:factory"
+        f"{shown(spec)} is no source of joints; expected udp://HOST:PORT, tcp://HOST:PORT, "
+        "rtde://HOST, a .csv file that grows, or module:factory"
     )
 
 
@@ -137,21 +148,18 @@ def _parsed(lines: Iterator[bytes]) -> Iterator[JointSample | str]:
             yield str(error)
 
 
-def _address(spec: str) -> tuple[str, int]:
+def _address(spec: str) -> tuple[str, int | None]:
     try:
         parts = urlsplit(spec)
-        host, port = parts.hostname or "", parts.port
+        return parts.hostname or "", parts.port
     except ValueError:
-        port = None
-    if not port:
-        raise TooltipError(f"{spec}: no port; expected e.g. udp://:9870 or tcp://robot:9870")
-    return host, port
+        return "", None
 
 
-def _udp(spec: str, host: str, port: int, halt: threading.Event) -> Iterator[bytes]:
+def _udp(spec: str, place: tuple[str, int], halt: threading.Event) -> Iterator[bytes]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         try:
-            receiver.bind((host, port))
+            receiver.bind(place)
         except OSError as error:
             raise TooltipError(f"{spec}: cannot be listened to ({one_line(error)})") from error
         receiver.settimeout(_POLL_S)
@@ -163,9 +171,9 @@ def _udp(spec: str, host: str, port: int, halt: threading.Event) -> Iterator[byt
             yield from datagram.splitlines()
 
 
-def _tcp(spec: str, host: str, port: int, halt: threading.Event) -> Iterator[bytes]:
+def _tcp(spec: str, place: tuple[str, int], halt: threading.Event) -> Iterator[bytes]:
     try:
-        connection = socket.create_connection((host, port), timeout=_CONNECT_S)
+        connection = socket.create_connection(place, timeout=_CONNECT_S)
     except OSError as error:
         raise TooltipError(f"{spec}: cannot be reached ({one_line(error)})") from error
     with connection:
@@ -184,6 +192,11 @@ def _tcp(spec: str, host: str, port: int, halt: threading.Event) -> Iterator[byt
             yield from lines
             if len(rest) > _MAX_LINE:
                 raise TooltipError(f"{spec}: sends a line without an end; expected JSON lines")
+
+
+def _arm(spec: str, host: str, port: int, halt: threading.Event) -> Iterator[JointSample]:
+    for positions in rtde.arm_positions(spec, host, port, halt):
+        yield JointSample(dict(zip(rtde.JOINTS, positions, strict=True)))
 
 
 def _grown(path: Path, halt: threading.Event) -> Iterator[JointSample | str]:

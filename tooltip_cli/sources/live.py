@@ -9,15 +9,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 from tooltip_cli.log.messages import Message
+from tooltip_cli.log.recording import IMAGE_TYPES
 from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.sources.base import SourceReport
 
 Deliver = Callable[[Message], None]
 
 QUEUE_BYTES = 256_000_000
-SMALL_BYTES = 1 << 16
-"""Smaller messages, such as joint states, have the last tenth of the queue to themselves."""
-_RESERVE = 0.1
+_RESERVE = 0.1  # of the queue, which images leave to everything else
 _OVERHEAD_BYTES = 300  # of a message in memory, besides its payload
 
 
@@ -92,8 +91,8 @@ class ArrivalClock:
 class Backlog:
     """A queue between receiving and writing that is bounded in bytes and never blocks a receiver.
 
-    What does not fit is dropped and counted by topic. Small messages may still enter where large
-    ones no longer fit, so that a flood of images does not cost the joints.
+    What does not fit is dropped and counted by topic. Other messages may still enter where images
+    no longer fit, so that a flood of images does not cost the joints.
 
     Args:
         limit_bytes: of all messages that wait.
@@ -110,7 +109,7 @@ class Backlog:
     def put(self, message: Message) -> None:
         """Add a message, or drop and count it."""
         size = len(message.payload) + _OVERHEAD_BYTES
-        limit = self._limit if size <= SMALL_BYTES else self._limit * (1 - _RESERVE)
+        limit = self._limit * (1 - _RESERVE if message.datatype in IMAGE_TYPES else 1)
         with self._condition:
             topic = message.topic
             self._received[topic] = self._received.get(topic, 0) + 1

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from tooltip_cli.errors import LowDiskError, TooltipError
 from tooltip_cli.log.crashsafe import MIN_FREE_BYTES, CrashSafeWriter, leftovers
-from tooltip_cli.log.messages import Message
+from tooltip_cli.log.messages import Message, header_stamp_ns
 from tooltip_cli.log.stopping import Stop
 from tooltip_cli.method.voting.watching import Verdict
 from tooltip_cli.sources.live import QUEUE_BYTES, LiveSource
@@ -20,6 +21,8 @@ from tooltip_cli.stages.watching import MotionObserver
 
 METADATA = "tooltip_recording"
 _STATUS_EVERY_S = 0.25
+_STEP_NS = 500_000_000  # back in stamps: a clock that was set, not messages that overtook others
+_STEPS_TOLD = 3  # of a topic; two senders with clocks apart would be told without end
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,8 @@ class _Recorder:
         self._observer, self._on_status, self._on_note = observer, on_status, on_note
         self.heard = Listening(source, reconnect=options.reconnect, queue_bytes=options.queue_bytes)
         self._first_image: float | None = None
+        self._latest_ns: dict[str, int] = {}  # header stamp of each topic
+        self._steps: Counter[str] = Counter()  # of the stamps, backwards
 
     def run(self, writer: CrashSafeWriter, out: Path) -> None:
         """Receive and write until an end is reached."""
@@ -150,8 +155,24 @@ class _Recorder:
         self._source.report.count(message.topic)
         if self._first_image is None and message.topic == self._source.image_topic:
             self._first_image = time.monotonic()
+        if message.topic in self._source.expected_topics:
+            self._follow_clock(message)
         if self._observer is not None:
             self._observer.take(message)
+
+    def _follow_clock(self, message: Message) -> None:
+        """Say where the stamps of a topic step back."""
+        topic, stamp_ns = message.topic, header_stamp_ns(message.payload)
+        if stamp_ns is None:
+            return
+        back_ns = self._latest_ns.get(topic, stamp_ns) - stamp_ns
+        if back_ns > _STEP_NS and self._steps[topic] < _STEPS_TOLD:
+            self._steps[topic] += 1
+            self.heard.note(
+                f"stamps on {topic} step back by {back_ns / 1e9:.1f} s: the sender's clock "
+                "was set, or it has started again"
+            )
+        self._latest_ns[topic] = stamp_ns
 
     def _ended(self) -> bool:
         """Whether an end is reached; its reason is then in ``ends``, or was the user's own."""

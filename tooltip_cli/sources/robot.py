@@ -1,8 +1,7 @@
-"""Live recordings of a ROS 2 robot, without ROS."""
+"""Live recordings of a robot that publishes ROS messages, without ROS."""
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterable, Mapping, Sequence
 
 from tooltip_cli.errors import TooltipError
@@ -12,42 +11,33 @@ from tooltip_cli.log.recording import IMAGE_TYPES, Topics
 from tooltip_cli.log.topics import choose_info, choose_topic
 from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.sources.base import SourceReport
-from tooltip_cli.sources.dds import (
-    DISCOVERY_S,
-    RECORDED_TYPES,
-    HeardTopic,
-    TopicReceiver,
-    heard_topics,
-    open_domain,
-)
+from tooltip_cli.sources.bus import DISCOVERY_S, RECORDED_TYPES, Bus, HeardTopic
 from tooltip_cli.sources.live import ArrivalClock, Receiver
 from tooltip_cli.sources.streams import robot_message, with_robot
 
 _EXPECTED = (*IMAGE_TYPES, messages.JOINT_STATE, messages.POSE_STAMPED)
 
 
-class Ros2Source:
-    """Images, intrinsics, joints or poses and the robot description of a ROS 2 robot.
+class RobotSource:
+    """Images, intrinsics, joints or poses and the robot description of a robot on a network.
 
     Topics that are named need not be there yet; others are the only ones of their types that are
     heard in the first seconds.
 
     Args:
-        domain: ``ROS_DOMAIN_ID`` of the robot.
+        bus: the network that the robot publishes on.
         topics: which topic to take for each role.
         rig: stored in the log; names the pose topic where poses stand for joints.
         urdf: a robot description that takes the place of the robot's own and the rig's.
         wait_s: seconds in which topics are looked for.
 
     Raises:
-        MissingExtraError: cyclonedds is not installed.
-        TooltipError: the domain cannot be joined, no images are heard, or several topics could be
-            meant.
+        TooltipError: no images are heard, or several topics could be meant.
     """
 
     def __init__(
         self,
-        domain: int = 0,
+        bus: Bus,
         topics: Topics | None = None,
         rig: Rig | None = None,
         urdf: str | None = None,
@@ -55,10 +45,10 @@ class Ros2Source:
     ) -> None:
         self._rig = with_robot(rig, urdf)
         self._urdf = urdf if urdf is not None else (rig.urdf if rig is not None else None)
-        self._report, self._clock, self._domain = SourceReport(), ArrivalClock(), domain
-        self._participant = open_domain(domain)
-        heard = heard_topics(self._participant, wait_s, threading.Event())
-        self._topics = self._choose(heard, topics or Topics())
+        self._report, self._clock, self._bus = SourceReport(), ArrivalClock(), bus
+        if self._urdf is None:
+            self._urdf = bus.robot_description()
+        self._topics = self._choose(bus.heard(wait_s), topics or Topics())
         self._image = self._topics[0].name
 
     @property
@@ -82,25 +72,24 @@ class Ros2Source:
         return self._report
 
     def first_messages(self) -> Sequence[Message]:
-        """Return the robot description that was given."""
+        """Return the robot description, where it is known beforehand."""
         return [] if self._urdf is None else [robot_message(self._clock.now_ns(), self._urdf)]
 
     def receivers(self) -> Sequence[Receiver]:
         """Return one receiver a topic."""
-        return [TopicReceiver(self._participant, topic, self._clock) for topic in self._topics]
+        return [self._bus.receiver(topic, self._clock, self._report) for topic in self._topics]
 
     def metadata(self) -> Mapping[str, str]:
         """Say whose clocks the stamps are."""
         return {
             **self._clock.metadata(),
             "header_stamps": "the publishers'",
-            "publish_time": "the DDS source timestamp, of the publisher's machine",
-            "ros_domain_id": str(self._domain),
+            **self._bus.metadata(),
         }
 
     def _choose(self, heard: Iterable[HeardTopic], wanted: Topics) -> list[HeardTopic]:
         known = {(topic.name, topic.datatype): topic for topic in heard}
-        where = f"DDS domain {self._domain}"
+        where = self._bus.where
         types = self._types(known, wanted)
         image = choose_topic(types, "image", IMAGE_TYPES, wanted.image, where, required=True)
         assert image is not None  # noqa: S101 - required
@@ -125,7 +114,7 @@ class Ros2Source:
         if self._urdf is None:
             chosen += [name for name in types if types[name] == messages.STRING][:1]
         return [
-            known.get((name, types[name]), HeardTopic(name, types[name], False, False))
+            known.get((name, types[name]), HeardTopic(name, types[name]))
             for name in chosen
             if name is not None
         ]

@@ -1,0 +1,53 @@
+"""Real ``tooltip record`` processes, and what they have written."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from tooltip_cli.log.container import LoggedMessage, iterate
+
+ROOT = Path(__file__).parents[2]
+
+
+def recorder(kind: str, out: Path, *arguments: object) -> subprocess.Popen[str]:
+    """Start ``tooltip record KIND OUT ...``."""
+    command = [sys.executable, "-m", "tooltip_cli.cli.main", "record", kind, str(out)]
+    command += map(str, arguments)
+    return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+
+
+def ended(process: subprocess.Popen[str], number: int | None = None) -> str:
+    """Return what a recorder said, after a signal or by itself; it must have ended well."""
+    if number is not None:
+        process.send_signal(number)
+    _, err = process.communicate(timeout=90)
+    assert process.returncode == 0, err
+    return err
+
+
+def by_topic(path: Path) -> dict[str, list[LoggedMessage]]:
+    """Return the messages of a log, which must be whole."""
+    found: dict[str, list[LoggedMessage]] = {}
+    for item in iterate(path):
+        if isinstance(item, LoggedMessage):
+            found.setdefault(item.topic, []).append(item)
+    return found
+
+
+def grown(out: Path, size: int) -> Callable[[], bool]:
+    """Return whether a recording in the making has so many bytes on the disk."""
+    unfinished = out.with_name(f"{out.name}.unfinished")
+    return lambda: unfinished.exists() and unfinished.stat().st_size > size
+
+
+def wait_for(condition: Callable[[], bool], what: str) -> None:
+    """Wait for something that happens within seconds."""
+    for _ in range(6000):
+        if condition():
+            return
+        time.sleep(0.01)
+    raise AssertionError(f"{what} did not happen")
