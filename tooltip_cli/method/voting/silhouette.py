@@ -26,6 +26,7 @@ NOTHING_KNOWN = 255
 
 _MASK_WIDTH = 400  # pixels; masks of wider images are stored at half, a third, ... of the size
 _BLUR_PX = 0.8  # standard deviation, of image and backdrop before they are compared
+_PIXELS_AT_ONCE = 1 << 14  # of all samples, so that they stay close to the processor
 _PLATEAU_PX = 7  # side of the square in which the contrast at an outline is looked up
 _NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0))  # rows and columns
 _GAUSSIAN_PER_MAD = 1.4826
@@ -105,9 +106,9 @@ def learn_backdrop(samples: Image, params: SilhouetteParams) -> Backdrop:
     import cv2
 
     middle = len(samples) // 2
-    colour = np.ascontiguousarray(np.partition(samples, middle, axis=0)[middle])
+    colour = _ranked(samples, middle)
     off = np.stack([_largest(cv2.absdiff(sample, colour)) for sample in samples])
-    spread = np.partition(off, middle, axis=0)[middle]
+    spread = _ranked(off, middle)
     noise = max(float(np.median(spread)), 1.0)
     tolerance = params.tolerance * _GAUSSIAN_PER_MAD * np.maximum(spread, noise)
     tolerance = np.clip(tolerance, params.least_contrast, 254.0)
@@ -115,6 +116,20 @@ def learn_backdrop(samples: Image, params: SilhouetteParams) -> Backdrop:
     unknown = (seen < params.min_seen) | (tolerance > params.most_contrast)
     tolerance = np.where(unknown, NOTHING_KNOWN, np.ceil(tolerance))
     return Backdrop(_blurred(colour), tolerance.astype(np.uint8))
+
+
+def _ranked(samples: Image, rank: int) -> Image:
+    """Return ``np.sort(samples, axis=0)[rank]``, bit by bit: counting takes a fifth of the time."""
+    flat = samples.reshape(len(samples), -1)
+    found = np.zeros(flat.shape[1], np.uint8)
+    counter = np.min_scalar_type(len(samples))
+    for start in range(0, len(found), _PIXELS_AT_ONCE):
+        part, values = flat[:, start : start + _PIXELS_AT_ONCE], found[start:][:_PIXELS_AT_ONCE]
+        for bit in (128, 64, 32, 16, 8, 4, 2, 1):
+            more = values | np.uint8(bit)
+            below = (part < more).view(np.uint8).sum(axis=0, dtype=counter)
+            np.copyto(values, more, where=below <= rank)
+    return found.reshape(samples.shape[1:])
 
 
 def silhouette(image: Image, backdrop: Backdrop, params: SilhouetteParams) -> FrameSilhouette:
@@ -130,9 +145,11 @@ def silhouette(image: Image, backdrop: Backdrop, params: SilhouetteParams) -> Fr
     contrast = _largest(cv2.absdiff(_blurred(image), backdrop.colour))
     known = backdrop.tolerance != NOTHING_KNOWN
     stands = _without_specks((contrast > backdrop.tolerance) & known, params.min_area)
-    if stands.mean() > params.max_share:
+    if np.count_nonzero(stands) > params.max_share * stands.size:
         known, stands = np.zeros_like(known), np.zeros_like(stands)
-    mask = np.where(known, np.where(stands, FOREGROUND, BACKGROUND), UNKNOWN).astype(np.uint8)
+    mask = np.full(known.shape, UNKNOWN, np.uint8)
+    np.copyto(mask, BACKGROUND, where=known)
+    np.copyto(mask, FOREGROUND, where=stands)
     mask, scale = _small(mask)
     left, top, width, height = cv2.boundingRect(stands.view(np.uint8))
     if not width:
@@ -181,10 +198,18 @@ def _largest(image: npt.ArrayLike) -> Image:
 def _without_specks(stands: npt.NDArray[np.bool_], least: int) -> npt.NDArray[np.bool_]:
     import cv2
 
-    _, parts, statistics, _ = cv2.connectedComponentsWithStats(stands.view(np.uint8))
-    large = statistics[:, cv2.CC_STAT_AREA] >= least
-    large[0] = False
-    return np.asarray(np.take(large, parts))
+    _, parts, statistics, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
+        stands.view(np.uint8),
+        8,
+        cv2.CV_32S,
+        cv2.CCL_BBDT,  # the default takes three times as long
+    )
+    kept = np.zeros(stands.shape, dtype=bool)
+    for part in 1 + np.flatnonzero(statistics[1:, cv2.CC_STAT_AREA] >= least):
+        left, top, width, height = statistics[part, : cv2.CC_STAT_AREA]
+        box = slice(top, top + height), slice(left, left + width)
+        kept[box] |= parts[box] == part
+    return kept
 
 
 def _outline(
