@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -11,7 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 import click
 
 from tooltip_cli.cli.options import (
-    printable,
+    StatusLine,
     say,
     size_in_bytes,
 )
@@ -32,6 +30,27 @@ if TYPE_CHECKING:
 _Command = TypeVar("_Command", bound=Callable[..., object])
 
 
+patience_option = click.option(
+    "--patience",
+    type=click.FloatRange(min=0.1),
+    default=10.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="End after so long without an image.",
+)
+reconnect_option = click.option(
+    "--reconnect",
+    is_flag=True,
+    help="Wait for a source that is not there or disappears, instead of ending.",
+)
+duration_option = click.option(
+    "--duration",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="End so long after the first image. Default: at Ctrl-C.",
+)
+
+
 def live_options(command: _Command) -> _Command:
     """Add what all live recordings have in common."""
     for option in (
@@ -44,56 +63,65 @@ def live_options(command: _Command) -> _Command:
             help="Memory for what is received and not yet written; what does not fit is dropped "
             "and counted.",
         ),
-        click.option(
-            "--patience",
-            type=click.FloatRange(min=0.1),
-            default=10.0,
-            show_default=True,
-            metavar="SECONDS",
-            help="End after so long without an image.",
-        ),
-        click.option(
-            "--reconnect",
-            is_flag=True,
-            help="Wait for a source that is not there or disappears, instead of ending.",
-        ),
+        patience_option,
+        reconnect_option,
         click.option(
             "--until-enough",
             is_flag=True,
             help="End once the motion has shown all that an estimate looks at; needs --rig.",
         ),
+        duration_option,
+    ):
+        command = option(command)
+    return command
+
+
+def camera_options(command: _Command) -> _Command:
+    """Add ``--camera``, ``--joints`` and ``--joint-stamps``."""
+    for option in (
         click.option(
-            "--duration",
-            type=click.FloatRange(min=0, min_open=True),
-            metavar="SECONDS",
-            help="End so long after the first image. Default: at Ctrl-C.",
+            "--joint-stamps",
+            type=click.Choice(["sender", "arrival"]),
+            default="sender",
+            show_default=True,
+            help="Whose clock the joints' stamps are, where the sender gives any.",
+        ),
+        click.option(
+            "--joints",
+            metavar="SOURCE",
+            help="udp://HOST:PORT or tcp://HOST:PORT with JSON lines, rtde://HOST of a UR robot, a "
+            "CSV file that grows, or a Python object module:factory.",
+        ),
+        click.option(
+            "--camera",
+            required=True,
+            metavar="SOURCE",
+            help="Number of a USB camera, http:// (MJPEG), rtsp:// or udp:// address, or a video "
+            "file.",
         ),
     ):
         command = option(command)
     return command
 
 
+def camera_source(
+    camera: str, joints: str | None, joint_stamps: str, rig: Path | None, robot: Path | None
+) -> LiveSource:
+    """Return the source that ``camera_options`` and ``rig_options`` name."""
+    from tooltip_cli.sources.camera import CameraSource
+
+    return CameraSource(
+        camera,
+        joints,
+        joints_by_arrival=joint_stamps == "arrival",
+        rig=load_rig_file(rig),
+        urdf=load_urdf(robot),
+    )
+
+
 @click.command("camera", short_help="Record a camera and joints without ROS.")
 @out_argument
-@click.option(
-    "--camera",
-    required=True,
-    metavar="SOURCE",
-    help="Number of a USB camera, http:// (MJPEG), rtsp:// or udp:// address, or a video file.",
-)
-@click.option(
-    "--joints",
-    metavar="SOURCE",
-    help="udp://HOST:PORT or tcp://HOST:PORT with JSON lines, rtde://HOST of a UR robot, a CSV "
-    "file that grows, or a Python object module:factory.",
-)
-@click.option(
-    "--joint-stamps",
-    type=click.Choice(["sender", "arrival"]),
-    default="sender",
-    show_default=True,
-    help="Whose clock the joints' stamps are, where the sender gives any.",
-)
+@camera_options
 @live_options
 @rig_options
 @result_options
@@ -129,17 +157,9 @@ def camera(
       tooltip record camera pliers.mcap --camera /dev/video2 --joints rtde://192.168.0.10
       tooltip record camera pliers.mcap --camera rtsp://head/live --joints arm:joints --duration 15
     """
-    from tooltip_cli.sources.camera import CameraSource
     from tooltip_cli.stages.live import LiveOptions
 
-    by_arrival = joint_stamps == "arrival"
-    source = CameraSource(
-        camera,
-        joints,
-        joints_by_arrival=by_arrival,
-        rig=load_rig_file(rig),
-        urdf=load_urdf(robot),
-    )
+    source = camera_source(camera, joints, joint_stamps, rig, robot)
     options = LiveOptions(duration, until_enough, reconnect, patience, queue, min_free)
     record_until_end(source, out, options, force, as_json)
 
@@ -155,7 +175,7 @@ def record_until_end(
     if source.rig is None and options.until_enough:
         raise click.UsageError("--until-enough needs --rig: without one no motion is judged")
     observer = MotionObserver(source.rig) if source.rig is not None else None
-    line = StatusLine(out)
+    line = StatusLine(str(out))
     try:
         with stop_on_signals() as stop:
             report = record_live(
@@ -165,7 +185,7 @@ def record_until_end(
                 stop=stop,
                 overwrite=force,
                 observer=observer,
-                on_status=line.show,
+                on_status=lambda status: line.show(status_text(status)),
                 on_note=line.note,
             ).report
     finally:
@@ -184,32 +204,6 @@ def record_until_end(
             "turn_deg": verdict.turn_deg,
         }
     finish(document, as_json)
-
-
-class StatusLine:
-    """One line on stderr that is written over, where that is a terminal; notes stay."""
-
-    def __init__(self, out: Path) -> None:
-        self._out, self._terminal = out, sys.stderr.isatty()
-
-    def show(self, status: Status) -> None:
-        """Show how the recording stands."""
-        if self._terminal:
-            # a line that wraps could not be written over
-            text = status_text(status)[: shutil.get_terminal_size().columns - 1]
-            sys.stderr.write(f"\r\x1b[K{text}")
-            sys.stderr.flush()
-
-    def note(self, text: str) -> None:
-        """Say something that stays."""
-        self.clear()
-        say(f"{self._out}: {printable(text)}")
-
-    def clear(self) -> None:
-        """Remove the line."""
-        if self._terminal:
-            sys.stderr.write("\r\x1b[K")
-            sys.stderr.flush()
 
 
 def status_text(status: Status) -> str:

@@ -22,6 +22,7 @@ from tooltip_cli.errors import MissingExtraError, TooltipError
 
 if TYPE_CHECKING:
     from tooltip_cli.sources.bus import Bus
+    from tooltip_cli.sources.live import LiveSource
 
 _Command = TypeVar("_Command", bound=Callable[..., object])
 TRANSPORTS = ("ros2", "zenoh", "ros1")
@@ -77,6 +78,24 @@ def master_option(command: _Command) -> _Command:
         metavar="URI",
         help="ROS 1 master.",
     )(command)
+
+
+def ros2_source(
+    image: str | None,
+    joints: str | None,
+    info: str | None,
+    pose: str | None,
+    domain: int,
+    rig: Path | None,
+    robot: Path | None,
+) -> LiveSource:
+    """Return the source that ``topic_options``, ``domain_option`` and ``rig_options`` name."""
+    from tooltip_cli.log.recording import Topics
+    from tooltip_cli.sources.dds import DdsBus
+    from tooltip_cli.sources.robot import RobotSource
+
+    given, urdf = load_rig_file(rig), load_urdf(robot)
+    return RobotSource(DdsBus(domain), Topics(image, joints, info, pose), given, urdf)
 
 
 @click.command("ros2", short_help="Record a ROS 2 robot over DDS, without ROS.")

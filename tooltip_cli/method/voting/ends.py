@@ -216,7 +216,9 @@ def _by_edges(
 
 def _refined(end: RefinedEnd, support: float, settings: VotingSettings) -> FoundEnd:
     covariance, axis_variance = _uncertainty(end, settings.trust)
-    candidate = Candidate(end.position, support, covariance, end.axis, axis_variance**0.5)
+    candidate = Candidate(
+        end.position, support, covariance, end.axis, axis_variance**0.5, end.agreement
+    )
     return FoundEnd(candidate, end.agreement)
 
 

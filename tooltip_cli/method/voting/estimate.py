@@ -76,7 +76,10 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     reason = _hidden(first.position, edges, trust)
     if reason is not None:
         return refused(METHOD, used, reason)
+    agreement = next(end.agreement for end in found if end.candidate is first)
     reasons = () if len(candidates) == 1 else (_ambiguous(candidates),)
+    if agreement < trust.doubtful_agreement:
+        reasons = (*reasons, _disagreeing(agreement))
     return TipEstimate(METHOD, first.position, first.covariance, tuple(candidates), reasons, used)
 
 
@@ -122,6 +125,16 @@ def _only_the_hand() -> Reason:
         "nothing_beyond_the_hand",
         "nothing fixed to the hand shows outside the spheres that stand for hand and wrist; check "
         "hand.spheres in the rig file, and that the hand holds a tool",
+    )
+
+
+def _disagreeing(agreement: float) -> Reason:
+    share = f"only {agreement:.0%} of what the images show of the end fits"
+    return Reason(
+        "images_disagree",
+        (share if agreement else "the images show too little of the end")
+        + "; the clocks or the camera's pose may be off: --refine all, or tooltip calibrate, finds "
+        "out by how much",
     )
 
 
