@@ -19,7 +19,7 @@ import pytest
 
 from tests.helpers.live import MjpegServer, free_port, joint_line, udp_joints
 from tests.helpers.logs import IMAGE_TOPIC, JOINT_TOPIC, image_message, joint_message, jpeg_of
-from tests.helpers.recorder import ROOT, by_topic, ended, recorder, wait_for
+from tests.helpers.recorder import ROOT, by_topic, ended, interruptible, recorder, wait_for
 from tests.helpers.robot import JOINTS
 from tests.helpers.robots import SYSTEM_PYTHON, has_ros1, ros1_environment
 from tests.helpers.ros2_robot import IMAGE, STATES
@@ -90,6 +90,7 @@ class Cable:
             cwd=ROOT,
             env={**os.environ, **environment},
             text=True,
+            preexec_fn=interruptible,  # noqa: PLW1509 - nothing else happens in between
             **pipes,  # type: ignore[call-overload]
         )
         return process

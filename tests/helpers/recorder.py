@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import time
@@ -13,11 +14,22 @@ from tooltip_cli.log.container import LoggedMessage, iterate
 ROOT = Path(__file__).parents[2]
 
 
+def interruptible() -> None:
+    """Let a new process take SIGINT, which one that runs in the background is born to ignore."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def recorder(kind: str, out: Path, *arguments: object) -> subprocess.Popen[str]:
     """Start ``tooltip record KIND OUT ...``."""
     command = [sys.executable, "-m", "tooltip_cli.cli.main", "record", kind, str(out)]
     command += map(str, arguments)
-    return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command,
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=interruptible,  # noqa: PLW1509 - nothing else happens between fork and exec
+    )
 
 
 def ended(process: subprocess.Popen[str], number: int | None = None) -> str:

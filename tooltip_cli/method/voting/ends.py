@@ -46,7 +46,7 @@ class FoundEnd:
 class _Rough:
     """Where an end may be."""
 
-    far: Array  # (3,) metres, hand frame: the voxel of it that is farthest from the grip
+    far: Array  # (3,) metres, hand frame: the voxel of it that is farthest from wrist or grip
     voted: ToolEnd | None
     solid: tuple[ToolEnd, ...]  # as the hull has it
 
@@ -54,10 +54,10 @@ class _Rough:
 def find_ends(
     edges: HandEdges, cloud: Cloud, shape: Shape, spheres: Array, settings: VotingSettings
 ) -> list[FoundEnd]:
-    """Return the tool's ends, the farthest from the grip first; at least one.
+    """Return the tool's ends, the farthest from the wrist first; at least one.
 
-    From the grip, not from the wrist: a tool that is held tilted towards the wrist has its handle's
-    end farther from that than its tip.
+    An end is also what is farthest from the grip: a tool that is held tilted towards the wrist has
+    its handle's end farther from that than its tip.
 
     Args:
         shape: where the votes say that hand or tool is; not empty.
@@ -92,9 +92,15 @@ def _apart(ends: list[FoundEnd], grip: Array, params: EndParams) -> list[FoundEn
     kept = [
         end for end in kept if end.agreement >= agreement and end.candidate.support >= support
     ] or kept[:1]
-    kept.sort(key=lambda end: -float(np.linalg.norm(end.candidate.position - grip)))
-    least = params.other_end_share * np.linalg.norm(kept[0].candidate.position - grip)
-    return [end for end in kept if np.linalg.norm(end.candidate.position - grip) >= least]
+    kept.sort(key=lambda end: -float(np.linalg.norm(end.candidate.position)))
+    first = kept[0].candidate.position
+    least, from_grip = params.other_end_share * np.linalg.norm(first), np.linalg.norm(first - grip)
+    return [
+        end
+        for end in kept
+        if np.linalg.norm(end.candidate.position) >= least
+        or np.linalg.norm(end.candidate.position - grip) > from_grip
+    ]
 
 
 def _rough_ends(
@@ -103,15 +109,15 @@ def _rough_ends(
     params, same, grip = settings.end, settings.outline.same_end, grip_of(spheres)
     votes = [
         (shape.voxels[far], locate_end(cloud, shape, shape.voxels[far], spheres, params))
-        for far in far_voxels(shape, params, grip)
+        for far in _both_ways(shape, grip, settings)
     ]
     silhouettes = edges.silhouettes
     rough: list[_Rough] = []
     if silhouettes is not None:
         hull = visual_hull(silhouettes, spheres, edges.reach, settings.hull)
         sure = _confirmed(hull, shape, settings.hull.confirmed)
-        bulges = [hull.voxels[row] for row in far_voxels(hull, params, grip)]
-        for row in far_voxels(sure, params, grip):
+        bulges = [hull.voxels[row] for row in _both_ways(hull, grip, settings)]
+        for row in _both_ways(sure, grip, settings):
             far = sure.voxels[row]
             near = [end for at, end in votes if np.linalg.norm(at - far) < same]
             solid = [locate_hull_end(sure, far, spheres, params)]
@@ -125,6 +131,16 @@ def _rough_ends(
         if all(np.linalg.norm(far - other.far) >= same for other in rough):
             rough.append(_Rough(far, end, ()))
     return rough
+
+
+def _both_ways(shape: Shape, grip: Array, settings: VotingSettings) -> list[int]:
+    """Return voxels that are far from the wrist, and the one that is farthest from the grip."""
+    rows = [int(row) for row in far_voxels(shape, settings.end)]
+    for row in far_voxels(shape, settings.end, grip)[:1]:
+        apart = np.linalg.norm(shape.voxels[rows] - shape.voxels[row], axis=1)
+        if (apart >= settings.outline.same_end).all():
+            rows.append(int(row))
+    return rows
 
 
 def _confirmed(hull: Shape, shape: Shape, within: float) -> Shape:
@@ -278,5 +294,5 @@ def _end_near(
     if not near.any():
         return None
     voxels = shape.voxels[near]
-    start = voxels[int(np.argmax(np.linalg.norm(voxels - grip_of(spheres), axis=1)))]
+    start = voxels[int(np.argmin(np.linalg.norm(voxels - far, axis=1)))]
     return locate_end(cloud, shape, start, spheres, params).position

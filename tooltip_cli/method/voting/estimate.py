@@ -145,7 +145,7 @@ def _ambiguous(candidates: list[Candidate]) -> Reason:
     )
     return Reason(
         "ambiguous_end",
-        f"the tool has {len(candidates)} ends at nearly the same distance from the grip; the "
-        f"farthest is given, the others are at {others} mm; --prefer with one "
+        f"the tool has {len(candidates)} ends that could be meant; the "
+        f"one farthest from the wrist is given, the others are at {others} mm; --prefer with one "
         "of these as direction chooses",
     )
