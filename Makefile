@@ -26,10 +26,10 @@ test: install
 	-@$(MAKE) --no-print-directory interop
 	$(BIN)/python -m pytest -n 2
 
-# An independent MCAP reader for the tests of our files; they skip without it.
+# An independent MCAP reader and axe-core for the tests of our files and pages; they skip without.
 interop:
 	@if command -v npm >/dev/null; then $(MAKE) --no-print-directory $(NODE_STAMP); \
-	else echo "npm is not installed: the tests with the node reader are skipped"; fi
+	else echo "npm is not installed: the tests with its packages are skipped"; fi
 
 $(NODE_STAMP): tests/interop/package.json
 	npm install --prefix tests/interop --no-package-lock --no-audit --no-fund --silent

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -24,7 +24,6 @@ from tests.helpers.logs import (
     write_true_labels,
 )
 from tests.helpers.robot import TIP, tip_in_camera
-from tooltip_cli.cli.compare import compare as compare_command
 from tooltip_cli.labels.files import TipLabels, match_labels, read_labels, write_labels
 from tooltip_cli.log.recording import read_recording
 from tooltip_cli.log.views import resolve_rig, resolve_views
@@ -251,9 +250,50 @@ def test_every_method_is_evaluated_alike(tmp_path: Path, method: str) -> None:
     assert row.tip_error_mm < 15
     sizes = [point.frames for point in row.training]
     assert sizes == sorted(sizes)
-    assert sizes[0] == 10
+    assert sizes[0] == {"voting": 30, "map": 10}[method]
     assert sizes[-1] <= 150  # no labelled frame, and no more than was asked for
     assert row.training[-1].error_px == pytest.approx(row.detector_px.mean)
+
+
+def test_what_voting_saw_is_kept_and_new_labels_cost_no_estimate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = 120
+    path = write_log(tmp_path / "wrist.mcap", wrist_parts(frames))
+    write_true_labels(tmp_path / "wrist.labels.csv", range(2, frames, 8))
+    first = evaluate([path], out=tmp_path / "r").recordings[0]
+    assert first.detector is not None
+    assert first.detector.position_m is not None
+    assert [point.frames for point in first.training][:1] == [50]
+    seen = json.loads((tmp_path / "r" / "tips" / "shape" / "wrist.shape.json").read_text())
+    # the tool is a stick whose other end lies 2 cm beside the hand's origin
+    along = np.array(seen["points"]) @ TIP / np.linalg.norm(TIP)
+    away = np.linalg.norm(
+        np.array(seen["points"]) - along[:, None] * TIP / np.linalg.norm(TIP), axis=1
+    )
+    assert np.median(away) < 0.015
+    assert along.max() == pytest.approx(np.linalg.norm(TIP), abs=0.02)
+
+    def never(*_: object) -> None:
+        raise AssertionError("estimated again")
+
+    rows = read_labels(tmp_path / "wrist.labels.csv")
+    moved = TipLabels(rows.stamps_ns, rows.pixels + 1.0, rows.states, rows.labelers)
+    write_labels(tmp_path / "wrist.labels.csv", moved)
+    with monkeypatch.context() as patch:
+        patch.setattr("tooltip_cli.stages.curve.estimate_by_voting", never)
+        patch.setattr("tooltip_cli.stages.shape.reconstruct", never)
+        again = evaluate([path], out=tmp_path / "r").recordings[0]
+    assert [point.shift_mm for point in again.training] == [
+        point.shift_mm for point in first.training
+    ]
+    assert again.training[0].error_px != first.training[0].error_px
+    for place in (tmp_path / "r" / "tips").glob("*/wrist.*.json"):
+        if place.parent.name in ("curve", "shape"):
+            place.write_text(place.read_text()[:-20])  # damaged: made anew
+    shutil.rmtree(tmp_path / "r" / "parts")
+    once_more = evaluate([path], out=tmp_path / "r").recordings[0]
+    assert once_more.training == again.training
 
 
 # What depends on what.
@@ -594,11 +634,11 @@ def test_compare_names_what_is_wrong(shelf: Path, tmp_path: Path) -> None:
 
 def test_the_compare_command_prints_the_same_as_its_json(shelf: Path, tmp_path: Path) -> None:
     pair = [str(shelf / "report"), str(variant(shelf / "report", tmp_path / "half", 0.5))]
-    shown = CliRunner().invoke(compare_command, pair)
-    document = json.loads(CliRunner().invoke(compare_command, [*pair, "--json"]).stdout)
-    assert shown.exit_code == 0
+    shown = tooltip("compare", *pair)
+    document = json.loads(tooltip("compare", *pair, "--json").out)
+    assert shown.code == 0
     tool = document[0]["tools"][0]
-    line = next(line for line in shown.stdout.splitlines() if line.startswith("wrist"))
+    line = next(line for line in shown.out.splitlines() if line.startswith("wrist"))
     assert line.endswith(BETTER)
     assert f"{tool['change_px']:+.2f} [{tool['low_px']:+.2f}, {tool['high_px']:+.2f}]" in line
 

@@ -33,17 +33,22 @@ LAYERS = {
 }
 FREE = {"errors", "resources", "machine_code", ""}
 HEAVY = (
+    "adlfs",
     "av",
+    "botocore",
     "cv2",
     "cyclonedds",
     "dask",
     "distributed",
+    "fsspec",
+    "gcsfs",
     "matplotlib",
     "numba",
     "numpy",
     "pinocchio",
     "pyarrow",
     "rosbags",
+    "s3fs",
     "scipy",
     "skimage",
     "starlette",

@@ -20,13 +20,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.helpers.cli import tooltip
 from tests.helpers.logs import wrist_parts, write_log, write_true_labels
 from tests.helpers.robot import TIP
 from tooltip_cli.errors import MissingExtraError, TooltipError
 from tooltip_cli.labels.files import TipLabels, read_labels, write_labels
 from tooltip_cli.method.estimators import EstimatorParams
 from tooltip_cli.method.evaluation import ErrorSummary
-from tooltip_cli.method.types import Reason
+from tooltip_cli.method.types import Candidate, Reason, TipEstimate
+from tooltip_cli.method.voting.estimate import METHOD as VOTING
 from tooltip_cli.report import charts, words, writer
 from tooltip_cli.report.model import (
     ErrorShares,
@@ -37,6 +39,7 @@ from tooltip_cli.report.model import (
 from tooltip_cli.report.overall import MeanOfTools, Totals
 from tooltip_cli.report.overlay import (
     BLACK,
+    GREEN,
     WHITE,
     Circle,
     Line,
@@ -45,9 +48,12 @@ from tooltip_cli.report.overlay import (
     whole,
     window_around,
 )
+from tooltip_cli.report.region import shadow
 from tooltip_cli.report.section import anchor
 from tooltip_cli.report.tables import latex_table
 from tooltip_cli.report.turnable import region_loops
+from tooltip_cli.stages import evaluate as evaluation
+from tooltip_cli.stages.estimate import Estimated, tip_document
 from tooltip_cli.stages.evaluate import evaluate
 
 Array = npt.NDArray[np.float64]
@@ -314,9 +320,11 @@ def test_anchors_are_safe_and_tell_names_apart(one: str, other: str) -> None:
 def test_every_figure_comes_in_all_forms_with_its_data(folder: Path) -> None:
     files = sorted((folder / "figures").iterdir())
     names = {path.stem for path in files}
-    kinds = ("prediction", "closeup", "edges", "rays", "over-time", "over-turn")
+    kinds = ("prediction", "closeup", "edges", "rays", "region", "over-time", "over-turn")
     assert names == {
         "error-by-tool",
+        "tip-error-by-tool",
+        "shares-by-tool",
         "detection-histogram",
         "error-by-training",
         *(f"{name}-{kind}" for name in NAMES for kind in kinds),
@@ -350,9 +358,86 @@ def test_figure_data_are_the_reports(folder: Path, report: EvaluationReport) -> 
         assert float(marks["mean_error_px"]) == pytest.approx(row.detector_px.mean, abs=1e-4)
     points = table(figures / "error-by-training.csv")
     for row in report.recordings:
-        last = [point for point in points if point["tool"] == row.name][-1]
+        mine = [point for point in points if point["tool"] == row.name]
         assert row.detector_px is not None
-        assert float(last["error_px"]) == pytest.approx(row.detector_px.mean, abs=1e-4)
+        assert float(mine[-1]["error_px"]) == pytest.approx(row.detector_px.mean, abs=1e-4)
+        assert [(int(item["frames"]), item["error_px"], item["low_px"]) for item in mine] == [
+            (point.frames, cell(point.error_px), cell(point.low_px)) for point in row.training
+        ]
+
+
+def cell(value: float | None) -> str:
+    return "" if value is None else f"{value:.4f}"
+
+
+def test_data_of_bars_are_the_reports(folder: Path, report: EvaluationReport) -> None:
+    figures = folder / "figures"
+    lengths = {row["tool"]: row for row in table(figures / "tip-error-by-tool.csv")}
+    parts = {row["tool"]: row for row in table(figures / "shares-by-tool.csv")}
+    for row in report.recordings:
+        assert row.detector is not None
+        assert row.detector.region_mm is not None
+        assert lengths[row.name] == {
+            "tool": row.name,
+            "tip_error_mm": cell(row.tip_error_mm),
+            "baseline_tip_error_mm": cell(row.baseline_tip_error_mm),
+            "region_mm": cell(row.detector.region_mm[0]),
+        }
+        assert row.shares is not None
+        assert parts[row.name] == {
+            "tool": row.name,
+            "total_px": cell(row.shares.total_px),
+            "detection_px": cell(row.shares.detection_px),
+            "clock_px": cell(row.shares.clock_px),
+            "calibration_px": cell(row.shares.calibration_px),
+        }
+
+
+def test_data_of_the_region_are_the_estimates(folder: Path, report: EvaluationReport) -> None:
+    row = report.recordings[0]
+    marks = {mark["what"]: mark for mark in table(folder / "figures" / "wrist-region.csv")}
+    assert list(marks) == ["estimate", "from labels", "true tip"]
+    assert row.detector is not None
+    assert row.detector.position_m is not None
+    for name, score in (("estimate", row.detector), ("from labels", row.baseline)):
+        assert score is not None
+        assert score.position_m is not None
+        offset = 1000 * (np.array(score.position_m) - np.array(row.detector.position_m))
+        found = [float(marks[name][f"{axis}_mm"]) for axis in "xyz"]
+        np.testing.assert_allclose(found, offset, atol=1e-4)
+        spread = [float(marks[name][f"c_{pair}_mm2"]) for pair in ("xx", "xy", "zz")]
+        covariance = 1e6 * np.array(score.covariance_m2)
+        np.testing.assert_allclose(
+            spread, [covariance[0, 0], covariance[0, 1], covariance[2, 2]], atol=1e-4
+        )
+    away = np.linalg.norm([float(marks["true tip"][f"{axis}_mm"]) for axis in "xyz"])
+    assert away == pytest.approx(row.tip_error_mm, abs=1e-3)
+
+
+def test_an_outline_is_the_ellipsoids_shadow() -> None:
+    """The farthest that any point of the ellipsoid reaches along each direction of the picture."""
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(3, 3)) * 1e-3
+    covariance = root @ root.T
+    sphere = rng.normal(size=(200_000, 3))
+    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+    surface = 1000 * np.sqrt(7.814727903251179) * sphere @ np.linalg.cholesky(covariance).T
+    for pair in ((0, 2), (1, 2), (0, 1)):
+        outline = shadow(covariance, pair)
+        for angle in np.linspace(0, np.pi, 7):
+            toward = np.array([np.cos(angle), np.sin(angle)])
+            reach = (surface[:, list(pair)] @ toward).max()
+            assert (outline @ toward).max() == pytest.approx(reach, rel=0.01)
+
+
+def test_figures_of_frames_hold_what_the_table_holds(folder: Path) -> None:
+    frames = {row["frame"]: row for row in table(folder / "frames.csv") if row["tool"] == NAMES[0]}
+    dots = table(folder / "figures" / "wrist-over-turn.csv")
+    assert {dot["frame"] for dot in dots} == set(frames)
+    for dot in dots:
+        assert dot["error_px"] == frames[dot["frame"]]["prediction_error_px"]
+        for axis in "xyz":
+            assert dot[f"turn_{axis}_deg"] == frames[dot["frame"]][f"turn_{axis}_deg"]
 
 
 def test_the_interest_point_is_the_heaviest_edge(folder: Path) -> None:
@@ -483,6 +568,8 @@ def test_shares_in_plain_words() -> None:
     assert "gives 2.0 px" in better
     unknown = words.share_words(shares(clock_offset_ms=None, clock_deviation_ms=None))
     assert "cannot be judged" in unknown
+    several = words.share_words(shares(), nearest_px=2.5)
+    assert "3.5 px of these are the choice between the tool's ends" in several
     assert "no visible part" in words.share_words(shares(label_noise_px=1.98))
     assert "about 1.7 px" in words.share_words(shares(label_noise_px=1.0))
 
@@ -517,10 +604,15 @@ def test_two_right_answers_are_both_named(report: EvaluationReport) -> None:
     other = replace(first, position_m=(0.1, 0.2, 0.3), error_px=1.25, tip_error_mm=4.0)
     reason = Reason("ambiguous_end", "two ends look alike")
     detector = replace(row.detector, candidates=(first, other), reasons=(reason,))
-    (text,) = words.candidate_words(detector)
+    text = words.end_words(other)
     assert "(100.0, 200.0, 300.0) mm" in text
     assert "1.2 px" in text
     assert "4.0 mm" in text
+    command = words.prefer_command(replace(row, recording="a b/pen.mcap"), other)
+    assert command == "tooltip estimate 'a b/pen.mcap' --prefer=0.100,0.200,0.300"
+    rig = {**row.provenance["rig"], "source": "my rig.yaml"}
+    given = replace(row, provenance={**row.provenance, "rig": rig})
+    assert "--rig 'my rig.yaml' --prefer" in words.prefer_command(given, other)
     ambiguous = replace(row, detector=detector, reasons=(reason,))
     assert "Two ends look alike." in words.verdict(ambiguous).text
 
@@ -580,6 +672,100 @@ def test_totals_do_not_grow_with_the_recordings(report: EvaluationReport, folder
 # In a browser.
 
 
+@pytest.fixture(scope="module")
+def two_ends(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a report on an estimate with two ends."""
+    place = tmp_path_factory.mktemp("ends")
+    path = write_log(place / "wrist.mcap", wrist_parts(FRAMES))
+    write_true_labels(place / "wrist.labels.csv", range(1, FRAMES, 4))
+    covariance, axis = np.diag([1e-6, 4e-6, 9e-6]), np.array([0.0, 0.6, -0.8])
+    ends = (
+        Candidate(-TIP, 0.5, covariance, axis, np.radians(2.0)),
+        Candidate(TIP, 0.4, covariance, -axis, np.radians(3.0)),
+    )
+    reason = Reason("ambiguous_end", "two ends look alike")
+    found = TipEstimate(VOTING, -TIP, covariance, ends, (reason,), FRAMES)
+
+    def ambiguous(*_: object, out: Path, **__: object) -> Estimated:
+        document = tip_document(found, {"key": "ends"})
+        return Estimated(out / "wrist.tip.json", "ends", False, found, document, None)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluation, "estimate_from_images", ambiguous)
+        evaluate([path], out=place / "out", curve=False)
+    return place / "out"
+
+
+def test_both_ends_of_a_tool_are_in_every_figure_that_shows_one(two_ends: Path) -> None:
+    for name in ("wrist-prediction", "wrist-closeup"):
+        svg = (two_ends / "figures" / f"{name}.svg").read_text()
+        assert GREEN in svg
+    rows = table(two_ends / "figures" / "wrist-rays.csv")
+    marked = [row for row in rows if row["panel"] == "training, by detection" and row["cluster"]]
+    places = {
+        row["kind"]: [float(row[f"{axis}1_m"]) for axis in "xyz"]
+        for row in marked
+        if row["kind"] in ("estimate", "candidate")
+    }
+    np.testing.assert_allclose(places["estimate"], -TIP, atol=1e-5)
+    np.testing.assert_allclose(places["candidate"], TIP, atol=1e-5)
+    page = (two_ends / "index.html").read_text()
+    assert "± 2.0 degrees" in page
+    assert "the choice between the tool&#39;s ends" in page
+    bars = table(two_ends / "figures" / "error-by-tool.csv")
+    assert float(bars[0]["nearest_candidate_px"]) < 0.1 < float(bars[0]["detector_px_mean"])
+
+
+def test_an_end_is_chosen_by_click_and_by_key(browser: Any, two_ends: Path) -> None:
+    """What the page then says runs, and takes that end."""
+    import shlex
+
+    view = browser.new_page(viewport={"width": 1280, "height": 900})
+    view.goto((two_ends / "index.html").as_uri())
+    assert view.locator(".chosen code").count() == 0
+    view.get_by_role("button", name="End 1").focus()
+    view.keyboard.press("Enter")
+    assert "--prefer=-0.030,0.050,0.120" in view.locator(".chosen code").inner_text()
+    canvas = view.locator(".turn canvas").nth(view.locator(".turn canvas").count() - 2)
+    canvas.scroll_into_view_if_needed()
+    u, v = canvas.evaluate(
+        """canvas => {
+          const scene = JSON.parse(canvas.closest(".turn").querySelector("script").textContent);
+          const view = { basis: scene.basis, zoom: 1 };
+          return projection(scene, view, canvas.clientWidth)(scene.ends[1].at, 0);
+        }"""
+    )
+    canvas.click(position={"x": u + 3, "y": v - 2})
+    command = view.locator(".chosen code").inner_text()
+    assert "--prefer=0.030,-0.050,-0.120" in command
+    assert view.get_by_role("button", name="End 2").get_attribute("aria-pressed") == "true"
+    view.close()
+    program, *arguments = shlex.split(command)
+    assert program == "tooltip"
+    done = tooltip(*arguments, "--json")
+    assert done.code in (0, 3), done.err
+    used = json.loads(done.out)["provenance"]["parameters"]["settings"]["prefer"]
+    assert used == [0.03, -0.05, -0.12]
+
+
+def test_the_accessibility_check_finds_nothing(browser: Any, folder: Path, two_ends: Path) -> None:
+    """axe-core, with every part of the page opened, in light and dark."""
+    script = Path(__file__).parent / "interop" / "node_modules" / "axe-core" / "axe.min.js"
+    if not script.is_file():
+        pytest.skip("axe-core is not installed: make interop")
+    for place, scheme in ((folder, "light"), (folder, "dark"), (two_ends, "light")):
+        context = browser.new_context(color_scheme=scheme, bypass_csp=True)
+        view = context.new_page()
+        view.goto((place / "index.html").as_uri())
+        view.evaluate("document.querySelectorAll('details').forEach(part => part.open = true)")
+        for chooser in view.get_by_role("button", name="End 2").all():
+            chooser.click()
+        view.evaluate(script.read_text(encoding="utf-8"))
+        found = view.evaluate("axe.run(document)")["violations"]
+        context.close()
+        assert [(item["id"], item["impact"]) for item in found] == []
+
+
 @pytest.fixture(params=[(1280, "light"), (400, "dark")], ids=["desk", "phone"])
 def shown(browser: Any, folder: Path, request: pytest.FixtureRequest) -> Iterator[Any]:
     """Yield the page in a browser; what it complains about fails the test."""
@@ -619,7 +805,7 @@ def test_the_rays_turn_by_drag_and_by_keyboard(shown: Any) -> None:
     shown.mouse.move(box["x"] + 90, box["y"] + 70)
     shown.mouse.up()
     assert canvas.evaluate(picture) != before
-    shown.get_by_role("button", name="Reset the view").first.click()
+    shown.get_by_role("button", name="Reset").first.click()
     assert canvas.evaluate(picture) == before
 
 

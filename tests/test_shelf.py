@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from tests.helpers.cli import tooltip
 from tests.helpers.logs import image_message, stamp_of, wrist_parts, write_log
 from tests.helpers.robot import RIG
-from tests.helpers.shelves import METHOD, artifacts, make_shelf, stamps, table
+from tests.helpers.shelves import METHOD, contents, hoard, make_shelf, stamps, table
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.rig.rigfile import rig_files
 from tooltip_cli.stages.shelf.plan import Item, part_of, read_shelf
@@ -203,11 +203,13 @@ def test_two_processes_do_what_one_does(ran: Path, tmp_path: Path) -> None:
         for row in rows.values():
             row["tip_file"] = Path(row["tip_file"]).name
     assert one == two
-    left, right = artifacts(ran / "run"), artifacts(tmp_path / "two")
-    assert list(left) == list(right)
-    tips = [name for name in left if name.endswith(".tip.json")]
-    assert len(tips) == 5
-    assert [left[name] for name in tips] == [right[name] for name in tips]
+    left, right = contents(ran / "run"), contents(tmp_path / "two")
+    for document in (left, right):
+        for name in [name for name in document if name.endswith("/row.json")]:
+            row = document[name]["row"]
+            row["tip_file"] = row["tip_file"] and Path(row["tip_file"]).name
+    assert left == right
+    assert len([name for name in left if name.endswith(".tip.json")]) == 5
 
 
 def test_a_second_run_does_only_what_is_left(shelf: Path) -> None:
@@ -303,6 +305,24 @@ def test_an_absurd_image_costs_its_own_recording_alone(wrist_file: Path, tmp_pat
     assert rows["good"]["status"] == "ok"
     assert rows["huge"]["status"] == "failed"
     assert "image 0" in rows["huge"]["reason"]
+
+
+def test_what_takes_all_memory_costs_its_own_recording_alone(
+    wrist_file: Path, tmp_path: Path
+) -> None:
+    shelf = make_shelf(tmp_path / "shelf", wrist_file, 2)
+    hoard(shelf / "hoard.mcap")
+    done = tooltip("run", shelf, *METHOD, "--memory", "1", "--jobs", 1)
+    assert "4 recordings: 2 ok, 0 refused, 2 failed" in done.out
+    rows = table(shelf / "run" / "results.csv")
+    assert rows["hoard"]["code"] == "out_of_memory"
+    assert "--memory" in rows["hoard"]["reason"]
+    assert "truncated" in rows["cut"]["reason"]
+    before = stamps(shelf / "run")
+    done = tooltip("run", shelf, *METHOD, "--memory", "6", "--jobs", 1)
+    assert "4 recordings: 3 ok, 0 refused, 1 failed; 2 reused" in done.out  # with enough it ends
+    after = stamps(shelf / "run")
+    assert {name for name in after if after[name] != before[name]} == {"cut", "hoard"}
 
 
 def test_what_was_finished_before_a_kill_is_finished(wrist_file: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from tests.helpers.cli import tooltip
 from tests.helpers.cluster import ROOT, Cluster
-from tests.helpers.shelves import METHOD, artifacts, make_shelf, stamps, table
+from tests.helpers.shelves import METHOD, contents, hoard, make_shelf, stamps, table
 from tests.helpers.work import misbehave
 from tooltip_cli.stages.shelf.cluster import on_dask
 from tooltip_cli.stages.shelf.plan import read_shelf
@@ -65,10 +65,33 @@ def test_a_lost_worker_costs_nothing_but_time(cluster: Cluster, shelf: Path) -> 
     assert "8 recordings: 7 ok, 0 refused, 1 failed; 0 reused" in out
     after = stamps(shelf / "run")
     assert {name: after[name] for name in before} == before  # nothing finished is done twice
-    cluster_rows, cluster_files = table(shelf / "run" / "results.csv"), artifacts(shelf / "run")
+    cluster_rows, cluster_files = table(shelf / "run" / "results.csv"), contents(shelf / "run")
     tooltip("run", shelf, *METHOD, "--jobs", 1, "--force")
     assert table(shelf / "run" / "results.csv") == cluster_rows
-    assert artifacts(shelf / "run") == cluster_files
+    assert contents(shelf / "run") == cluster_files
+
+
+def test_one_process_two_and_a_cluster_agree(wrist_file: Path, shelf: Path, tmp_path: Path) -> None:
+    hoard(shelf / "hoard.mcap")
+    cluster = Cluster(tmp_path)
+    try:
+        cluster.start(2, memory="1GiB")
+        done = tooltip("run", shelf, *METHOD, "--dask", cluster.address)
+    finally:
+        cluster.stop()
+    assert "9 recordings: 7 ok, 0 refused, 2 failed; 0 reused" in done.out, done.err
+    rows, files = table(shelf / "run" / "results.csv"), contents(shelf / "run")
+    assert rows.pop("hoard")["status"] == "failed"
+    for jobs in (1, 2):
+        done = tooltip("run", shelf, *METHOD, "--jobs", jobs, "--memory", 1, "--force")
+        assert "9 recordings: 7 ok, 0 refused, 2 failed; 0 reused" in done.out, done.err
+        others = table(shelf / "run" / "results.csv")
+        assert others.pop("hoard")["code"] == "out_of_memory"
+        assert others == rows
+        again = contents(shelf / "run")
+        for document in (again, files):
+            document.pop("recordings/hoard/row.json", None)
+        assert again == files
 
 
 def test_a_scheduler_that_comes_back_is_asked_again(cluster: Cluster, shelf: Path) -> None:

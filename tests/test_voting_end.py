@@ -196,6 +196,16 @@ def test_a_nearer_end_is_no_candidate() -> None:
     assert far_voxels(shape, replace(PARAMS, end_separation=0.01)).tolist() == [0, 3, 1]
 
 
+def test_an_end_is_far_from_the_grip() -> None:
+    """A tool held tilted towards the wrist: its handle's end is farther from that than its tip."""
+    tip, handle = np.array([0.103, -0.019, -0.008]), np.array([-0.036, -0.035, 0.148])
+    shape = Shape(np.stack([handle, tip]), np.full(2, 9.0))
+    grip = np.array([0.0, -0.027, 0.061])
+    assert far_voxels(shape, PARAMS).tolist() == [0]
+    assert far_voxels(shape, PARAMS, grip).tolist() == [1]
+    assert far_voxels(shape, replace(PARAMS, other_end_share=0.6), grip).tolist() == [1, 0]
+
+
 def test_of_voxels_that_are_equally_far_one_stands_for_the_end() -> None:
     voxels = 0.004 * np.array([[20.0, 21, 42], [21, 20, 42], [20, 20, 42], [-20, 21, -42]])
     assert far_voxels(Shape(voxels, np.ones(4)), PARAMS).tolist() == [0, 3]

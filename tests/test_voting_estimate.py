@@ -212,6 +212,15 @@ def test_poses_of_other_images_are_refused() -> None:
     assert refusal_of(estimate_by_voting(shifted, SPHERES, SETTINGS)) == "inconsistent_views"
 
 
+def test_it_is_said_when_the_images_agree_little() -> None:
+    assert not estimate_by_voting(view(TIP), SPHERES, SETTINGS).reasons
+    demanding = replace(SETTINGS, trust=replace(SETTINGS.trust, doubtful_agreement=1.01))
+    found = estimate_by_voting(view(TIP), SPHERES, demanding)
+    assert found.status == "ok"
+    assert [reason.code for reason in found.reasons] == ["images_disagree"]
+    assert "--refine all" in found.reasons[0].text
+
+
 def test_no_edges_are_refused() -> None:
     edges = view(TIP)
     empty = replace(

@@ -23,8 +23,12 @@ class Cluster:
         self.scheduler: subprocess.Popen[bytes] | None = None
         self.workers: list[subprocess.Popen[bytes]] = []
 
-    def start(self, workers: int) -> None:
-        """Start the scheduler, where it was before, and workers."""
+    def start(self, workers: int, memory: str = "0") -> None:
+        """Start the scheduler, where it was before, and workers.
+
+        Args:
+            memory: of each worker, which is ended when it uses more; "0": as much as it wants.
+        """
         address = self._folder / "scheduler.json"
         address.unlink(missing_ok=True)
         self.scheduler = self._process(
@@ -37,7 +41,7 @@ class Cluster:
         self.address: str = json.loads(address.read_text())["address"]
         self._port = int(self.address.rpartition(":")[2])
         for _ in range(workers):
-            limits = ("--nthreads", 1, "--memory-limit", 0)
+            limits = ("--nthreads", 1, "--memory-limit", memory)
             self.workers.append(self._process("dask_worker", self.address, *limits))
 
     def _process(self, command: str, *arguments: object) -> subprocess.Popen[bytes]:

@@ -24,6 +24,7 @@ from tooltip_cli.cli.options import (
     rig_option,
     say,
     say_profile,
+    tip_sentence,
     topic_options,
 )
 
@@ -131,24 +132,8 @@ def estimate(
         refusals += found.estimate.position is None
         documents.append(found.document)
         if not as_json:
-            click.echo(_sentence(path, found.document))
+            click.echo(tip_sentence(path.stem, found.document))
     if as_json:
         print_json(documents[0] if len(documents) == 1 else documents)
     if refusals:
         ctx.exit(3)
-
-
-def _sentence(path: Path, document: dict[str, Any]) -> str:
-    if document["status"] == "refused":
-        codes = ", ".join(reason["code"] for reason in document["reasons"])
-        return f"{path.stem}: refused ({codes})"
-    position = document["tip"]["position_m"]
-    variances = [document["tip"]["covariance_m2"][axis][axis] for axis in range(3)]
-    axes = ", ".join(
-        f"{name} {1000 * value:.1f} +-{1000 * variance**0.5:.1f}"
-        for name, value, variance in zip("xyz", position, variances, strict=True)
-    )
-    return (
-        f"{path.stem}: tip at {axes} mm in the hand frame "
-        f"({document['method']}, {document['frames_used']} frames)"
-    )

@@ -17,9 +17,9 @@ from tooltip_cli.cli.options import (
     prefer_option,
     print_json,
     progress,
-    recordings_argument,
     say,
     topic_options,
+    without_results,
 )
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ EXIT_CODES = {"ok": 0, "refused": 3, "failed": 1}
 
 
 @click.command()
-@recordings_argument
+@click.argument("recordings", nargs=-1, required=True, metavar="REC... | SHELF")
 @click.option(
     "--labels",
     type=PATH,
@@ -79,8 +79,8 @@ EXIT_CODES = {"ok": 0, "refused": 3, "failed": 1}
 @click.option(
     "--curve/--no-curve",
     default=None,
-    help="Whether to estimate from ever fewer training frames too. Default: with kmeans and map, "
-    "where that is quick.",
+    help="Whether to estimate from ever fewer training frames too. Default: as far as that is "
+    "quick; with voting from 50 and 100 once, where --curve draws 30, 50 and 100 several times.",
 )
 @click.option(
     "--frame",
@@ -102,7 +102,7 @@ EXIT_CODES = {"ok": 0, "refused": 3, "failed": 1}
 @click.pass_context
 def evaluate(
     ctx: click.Context,
-    recordings: tuple[Path, ...],
+    recordings: tuple[str, ...],
     labels: Path | None,
     second_labels: Path | None,
     rig: Path | None,
@@ -130,6 +130,11 @@ def evaluate(
     report.json, tools.csv, frames.csv, tools.tex and every figure as SVG, PNG and CSV. Without
     labels the report says what can be told all the same.
 
+    A SHELF (a folder, a pattern, a manifest, or an address in a store) is taken through 'tooltip
+    run' first, with what is finished left alone, and gets the report over many recordings: tables
+    by tool and rig, worst cases, changes over time. The table that 'tooltip run' wrote gets that
+    report from its rows alone. --method, --rig, --out, --jobs, --force and topics apply.
+
     Exits with 0 when at least one recording has an estimate, 3 when every estimate was refused,
     and 1 when none could be evaluated.
 
@@ -138,7 +143,28 @@ def evaluate(
       tooltip evaluate pliers.mcap
       tooltip evaluate *.mcap --out results --jobs 2
       tooltip evaluate pen.mcap --rig pen.rig.yaml --labels pen.labels.csv
+      tooltip evaluate shelf --jobs 8
+      tooltip evaluate shelf/run/results.parquet
     """
+    if is_shelf(recordings):
+        from tooltip_cli.cli.run import evaluate_shelf
+
+        _refuse_for_shelf(ctx)
+        evaluate_shelf(
+            ctx,
+            recordings[0],
+            as_json,
+            rig=None if rig is None else str(rig),
+            method=method,
+            jobs=jobs,
+            out=None if out is None else str(out),
+            image=image,
+            joints=joints,
+            info=info,
+            pose=pose,
+            force=force,
+        )
+        return
     from tooltip_cli.log.recording import Topics
     from tooltip_cli.method.estimators import EstimatorParams
     from tooltip_cli.method.voting.params import VotingSettings
@@ -147,7 +173,7 @@ def evaluate(
 
     with progress(None, "detect, pairs") as advance:
         report = run(
-            recordings,
+            without_results(tuple(map(Path, recordings))),
             labels=labels,
             second_labels=second_labels,
             rig=rig,
@@ -170,6 +196,36 @@ def evaluate(
     else:
         print_summary(report)
     ctx.exit(EXIT_CODES[report.status])
+
+
+_TABLES = (".csv", ".parquet")
+_OF_A_SHELF = ("recordings", "rig", "method", "out", "jobs", "force", "as_json")
+_TOPICS = ("image", "joints", "info", "pose")
+
+
+def is_shelf(recordings: Sequence[str]) -> bool:
+    """Tell a shelf, which stands alone, from recordings."""
+    if len(recordings) != 1:
+        return False
+    (text,) = recordings
+    path = Path(text)
+    return (
+        "://" in text
+        or (path.is_dir() and path.suffix != ".mcap")
+        or path.suffix.lower() in _TABLES
+        or (any(character in text for character in "*?[") and not path.exists())
+    )
+
+
+def _refuse_for_shelf(ctx: click.Context) -> None:
+    """Refuse options that a shelf would pass over."""
+    for parameter in ctx.command.params:
+        name = parameter.name or ""
+        given = ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
+        if given and name not in (*_OF_A_SHELF, *_TOPICS):
+            raise click.UsageError(
+                f"{parameter.opts[0]} is for recordings that are named one by one, not for a shelf"
+            )
 
 
 def print_summary(report: EvaluationReport) -> None:

@@ -27,6 +27,7 @@ COMMANDS = {
     "run": "Take many recordings through every stage, resumable.",
     "calibrate": "Find clock offset and camera pose from recordings of one robot.",
     "compare": "Compare reports, frame by frame.",
+    "watch": "Estimate the tip while images arrive.",
     "export": "Write the result for viewers and robots.",
     "demo": "Simulate recordings and take them through every stage.",
 }

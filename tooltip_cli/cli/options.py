@@ -6,6 +6,7 @@ import datetime
 import json
 import math
 import re
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -46,11 +47,11 @@ def recordings_argument(command: _Command) -> _Command:
         required=True,
         type=PATH,
         metavar="REC...",
-        callback=lambda ctx, parameter, paths: _without_results(paths),
+        callback=lambda ctx, parameter, paths: without_results(paths),
     )(command)
 
 
-def _without_results(paths: tuple[Path, ...]) -> tuple[Path, ...]:
+def without_results(paths: tuple[Path, ...]) -> tuple[Path, ...]:
     """Leave out our own results, so that ``*.mcap`` still means the recordings beside them."""
     kept = tuple(path for path in paths if not path.name.endswith(_RESULTS))
     return kept or paths
@@ -221,6 +222,36 @@ def progress(total: int | None, label: str) -> Iterator[Callable[[], None]]:
             sys.stderr.flush()
 
 
+class StatusLine:
+    """One line on stderr that is written over, where that is a terminal; notes stay.
+
+    Args:
+        name: what notes are about.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name, self.terminal = name, sys.stderr.isatty()
+
+    def show(self, text: str) -> None:
+        """Show how things stand."""
+        if self.terminal:
+            # a line that wraps could not be written over
+            text = text[: shutil.get_terminal_size().columns - 1]
+            sys.stderr.write(f"\r\x1b[K{text}")
+            sys.stderr.flush()
+
+    def note(self, text: str) -> None:
+        """Say something that stays."""
+        self.clear()
+        say(f"{self._name}: {printable(text)}")
+
+    def clear(self) -> None:
+        """Remove the line."""
+        if self.terminal:
+            sys.stderr.write("\r\x1b[K")
+            sys.stderr.flush()
+
+
 class Direction(click.ParamType):  # type: ignore[type-arg]  # generic in newer click only
     """A direction as three numbers, ``X,Y,Z``."""
 
@@ -264,3 +295,23 @@ def refinement_sentence(refined: dict[str, Any]) -> str:
         f"without and {refined['support_after']:.0%} with it"
     )
     return f"{text}: {'used' if refined['applied'] else 'not used'}; {shares}"
+
+
+def tip_sentence(name: str, document: dict[str, Any]) -> str:
+    """Say in words what ``tip.json`` holds."""
+    if document["status"] == "refused":
+        codes = ", ".join(reason["code"] for reason in document["reasons"])
+        return f"{name}: refused ({codes})"
+    return (
+        f"{name}: tip at {position_words(document['tip'])} mm in the hand frame "
+        f"({document['method']}, {document['frames_used']} frames)"
+    )
+
+
+def position_words(tip: dict[str, Any]) -> str:
+    """Return a tip's coordinates with their standard deviations, millimetres."""
+    variances = [tip["covariance_m2"][axis][axis] for axis in range(3)]
+    return ", ".join(
+        f"{name} {1000 * value:.1f} +-{1000 * variance**0.5:.1f}"
+        for name, value, variance in zip("xyz", tip["position_m"], variances, strict=True)
+    )

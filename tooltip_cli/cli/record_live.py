@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -11,9 +9,9 @@ from typing import TYPE_CHECKING, TypeVar
 import click
 
 from tooltip_cli.cli.options import (
+    StatusLine,
     json_option,
     print_json,
-    printable,
     say,
     size_in_bytes,
     table,
@@ -36,6 +34,27 @@ if TYPE_CHECKING:
 _Command = TypeVar("_Command", bound=Callable[..., object])
 
 
+patience_option = click.option(
+    "--patience",
+    type=click.FloatRange(min=0.1),
+    default=10.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="End after so long without an image.",
+)
+reconnect_option = click.option(
+    "--reconnect",
+    is_flag=True,
+    help="Wait for a source that is not there or disappears, instead of ending.",
+)
+duration_option = click.option(
+    "--duration",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="End so long after the first image. Default: at Ctrl-C.",
+)
+
+
 def live_options(command: _Command) -> _Command:
     """Add what all live recordings have in common."""
     for option in (
@@ -48,56 +67,94 @@ def live_options(command: _Command) -> _Command:
             help="Memory for what is received and not yet written; what does not fit is dropped "
             "and counted.",
         ),
-        click.option(
-            "--patience",
-            type=click.FloatRange(min=0.1),
-            default=10.0,
-            show_default=True,
-            metavar="SECONDS",
-            help="End after so long without an image.",
-        ),
-        click.option(
-            "--reconnect",
-            is_flag=True,
-            help="Wait for a source that is not there or disappears, instead of ending.",
-        ),
+        patience_option,
+        reconnect_option,
         click.option(
             "--until-enough",
             is_flag=True,
             help="End once the motion has shown all that an estimate looks at; needs --rig.",
         ),
+        duration_option,
+    ):
+        command = option(command)
+    return command
+
+
+def camera_options(command: _Command) -> _Command:
+    """Add ``--camera``, ``--joints`` and ``--joint-stamps``."""
+    for option in (
         click.option(
-            "--duration",
-            type=click.FloatRange(min=0, min_open=True),
-            metavar="SECONDS",
-            help="End so long after the first image. Default: at Ctrl-C.",
+            "--joint-stamps",
+            type=click.Choice(["sender", "arrival"]),
+            default="sender",
+            show_default=True,
+            help="Whose clock the joints' stamps are, where the sender gives any.",
+        ),
+        click.option(
+            "--joints",
+            metavar="SOURCE",
+            help="udp://HOST:PORT or tcp://HOST:PORT with JSON lines, a CSV file that grows, or a "
+            "Python object module:factory.",
+        ),
+        click.option(
+            "--camera",
+            required=True,
+            metavar="SOURCE",
+            help="Number of a USB camera, http:// (MJPEG), rtsp:// or udp:// address, or a video "
+            "file.",
         ),
     ):
         command = option(command)
     return command
 
 
+def camera_source(
+    camera: str, joints: str | None, joint_stamps: str, rig: Path | None, robot: Path | None
+) -> LiveSource:
+    """Return the source that ``camera_options`` and ``rig_options`` name."""
+    from tooltip_cli.sources.camera import CameraSource
+
+    return CameraSource(
+        camera,
+        joints,
+        joints_by_arrival=joint_stamps == "arrival",
+        rig=load_rig_file(rig),
+        urdf=load_urdf(robot),
+    )
+
+
+domain_option = click.option(
+    "--domain",
+    type=click.IntRange(0, 232),
+    default=0,
+    show_default=True,
+    envvar="ROS_DOMAIN_ID",
+    show_envvar=True,
+    metavar="N",
+    help="DDS domain of the robot.",
+)
+
+
+def ros2_source(
+    image: str | None,
+    joints: str | None,
+    info: str | None,
+    pose: str | None,
+    domain: int,
+    rig: Path | None,
+    robot: Path | None,
+) -> LiveSource:
+    """Return the source that ``topic_options``, ``domain_option`` and ``rig_options`` name."""
+    from tooltip_cli.log.recording import Topics
+    from tooltip_cli.sources.ros2 import Ros2Source
+
+    topics = Topics(image, joints, info, pose)
+    return Ros2Source(domain, topics, load_rig_file(rig), load_urdf(robot))
+
+
 @click.command("camera", short_help="Record a camera and joints without ROS.")
 @out_argument
-@click.option(
-    "--camera",
-    required=True,
-    metavar="SOURCE",
-    help="Number of a USB camera, http:// (MJPEG), rtsp:// or udp:// address, or a video file.",
-)
-@click.option(
-    "--joints",
-    metavar="SOURCE",
-    help="udp://HOST:PORT or tcp://HOST:PORT with JSON lines, a CSV file that grows, or a Python "
-    "object module:factory.",
-)
-@click.option(
-    "--joint-stamps",
-    type=click.Choice(["sender", "arrival"]),
-    default="sender",
-    show_default=True,
-    help="Whose clock the joints' stamps are, where the sender gives any.",
-)
+@camera_options
 @live_options
 @rig_options
 @result_options
@@ -132,17 +189,9 @@ def camera(
       tooltip record camera pliers.mcap --camera http://head/stream --joints tcp://robot:9870
       tooltip record camera pliers.mcap --camera rtsp://head/live --joints arm:joints --duration 15
     """
-    from tooltip_cli.sources.camera import CameraSource
     from tooltip_cli.stages.live import LiveOptions
 
-    by_arrival = joint_stamps == "arrival"
-    source = CameraSource(
-        camera,
-        joints,
-        joints_by_arrival=by_arrival,
-        rig=load_rig_file(rig),
-        urdf=load_urdf(robot),
-    )
+    source = camera_source(camera, joints, joint_stamps, rig, robot)
     options = LiveOptions(duration, until_enough, reconnect, patience, queue, min_free)
     _record(source, out, options, force, as_json)
 
@@ -150,16 +199,7 @@ def camera(
 @click.command("ros2", short_help="Record a ROS 2 robot, without ROS.")
 @out_argument
 @topic_options
-@click.option(
-    "--domain",
-    type=click.IntRange(0, 232),
-    default=0,
-    show_default=True,
-    envvar="ROS_DOMAIN_ID",
-    show_envvar=True,
-    metavar="N",
-    help="DDS domain of the robot.",
-)
+@domain_option
 @live_options
 @rig_options
 @result_options
@@ -192,27 +232,15 @@ def ros2(
       tooltip record ros2 pliers.mcap --duration 15 --rig rig.yaml
       tooltip record ros2 pliers.mcap --image /head/image_raw/compressed --domain 7
     """
-    from tooltip_cli.log.recording import Topics
-    from tooltip_cli.sources.ros2 import Ros2Source
     from tooltip_cli.stages.live import LiveOptions
 
-    topics = Topics(image, joints, info, pose)
-    source = Ros2Source(domain, topics, load_rig_file(rig), load_urdf(robot))
+    source = ros2_source(image, joints, info, pose, domain, rig, robot)
     options = LiveOptions(duration, until_enough, reconnect, patience, queue, min_free)
     _record(source, out, options, force, as_json)
 
 
 @click.command("list", short_help="Show what can be heard.")
-@click.option(
-    "--domain",
-    type=click.IntRange(0, 232),
-    default=0,
-    show_default=True,
-    envvar="ROS_DOMAIN_ID",
-    show_envvar=True,
-    metavar="N",
-    help="DDS domain of the robot.",
-)
+@domain_option
 @json_option
 def list_(domain: int, as_json: bool) -> None:
     """Show the topics of a ROS 2 robot: names, types, rates.
@@ -251,7 +279,7 @@ def _record(
     if source.rig is None and options.until_enough:
         raise click.UsageError("--until-enough needs --rig: without one no motion is judged")
     observer = MotionObserver(source.rig) if source.rig is not None else None
-    line = StatusLine(out)
+    line = StatusLine(str(out))
     try:
         with stop_on_signals() as stop:
             report = record_live(
@@ -261,7 +289,7 @@ def _record(
                 stop=stop,
                 overwrite=force,
                 observer=observer,
-                on_status=line.show,
+                on_status=lambda status: line.show(status_text(status)),
                 on_note=line.note,
             ).report
     finally:
@@ -280,32 +308,6 @@ def _record(
             "turn_deg": verdict.turn_deg,
         }
     finish(document, as_json)
-
-
-class StatusLine:
-    """One line on stderr that is written over, where that is a terminal; notes stay."""
-
-    def __init__(self, out: Path) -> None:
-        self._out, self._terminal = out, sys.stderr.isatty()
-
-    def show(self, status: Status) -> None:
-        """Show how the recording stands."""
-        if self._terminal:
-            # a line that wraps could not be written over
-            text = status_text(status)[: shutil.get_terminal_size().columns - 1]
-            sys.stderr.write(f"\r\x1b[K{text}")
-            sys.stderr.flush()
-
-    def note(self, text: str) -> None:
-        """Say something that stays."""
-        self.clear()
-        say(f"{self._out}: {printable(text)}")
-
-    def clear(self) -> None:
-        """Remove the line."""
-        if self._terminal:
-            sys.stderr.write("\r\x1b[K")
-            sys.stderr.flush()
 
 
 def status_text(status: Status) -> str:

@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -19,15 +18,16 @@ from tooltip_cli.cli.options import (
     METHODS,
     force_option,
     json_option,
-    out_option,
     print_json,
-    rig_option,
+    progress,
     say,
     topic_options,
 )
+from tooltip_cli.errors import MissingExtraError
 
 if TYPE_CHECKING:
     from tooltip_cli.stages.shelf.run import Engine, Plan
+    from tooltip_cli.stages.shelf.store import Place
     from tooltip_cli.stages.shelf.table import Row
 
 _PART = re.compile(r"(\d+)/(\d+)")
@@ -47,7 +47,12 @@ def _part(
 
 @click.command()
 @click.argument("shelf", metavar="SHELF")
-@rig_option
+@click.option(
+    "--rig",
+    metavar="PLACE",
+    help="Rig file: which frame is the hand, where the camera sits. Default: the one stored in "
+    "each recording.",
+)
 @click.option(
     "--method",
     type=click.Choice(METHODS),
@@ -87,7 +92,17 @@ def _part(
     help="Read finished recordings too and compare their content, where otherwise size and time of "
     "change are believed.",
 )
-@out_option
+@click.option(
+    "--out",
+    metavar="PLACE",
+    help="Folder of the results. Default: 'run' in SHELF, or NAME.run beside a manifest.",
+)
+@click.option(
+    "--report/--no-report",
+    default=True,
+    show_default=True,
+    help="Whether to write the report over all recordings; never with --part.",
+)
 @topic_options
 @force_option
 @json_option
@@ -95,14 +110,15 @@ def _part(
 def run(
     ctx: click.Context,
     shelf: str,
-    rig: Path | None,
+    rig: str | None,
     method: str,
     jobs: int,
     memory: float | None,
     dask: str | None,
     part: tuple[int, int] | None,
     verify: bool,
-    out: Path | None,
+    out: str | None,
+    report: bool,
     image: str | None,
     joints: str | None,
     info: str | None,
@@ -118,8 +134,9 @@ def run(
     the results table and does not stop the others. The same command again goes on where it was
     stopped, and tries what failed once more. Exits with 1 when a recording failed.
 
-    Writes results.csv and results.parquet to --out; by default that is the folder 'run' in SHELF,
-    or NAME.run beside a manifest.
+    Writes results.csv, results.parquet and a report over all of them to --out. Every place may also
+    be an address such as s3://bucket/folder, gs://... or az://...; credentials are found as the
+    provider's own tools do.
 
     \b
     Examples:
@@ -127,12 +144,13 @@ def run(
       tooltip run 'logs/*/*.mcap' --rig rig.yaml --out results
       tooltip run manifest.csv --part 3/16
       tooltip run /data/shelf --dask tcp://10.0.0.1:8786
+      tooltip run s3://lab/shelf --out s3://lab/results
     """
     from tooltip_cli.log.recording import Topics
     from tooltip_cli.method.estimators import EstimatorParams
-    from tooltip_cli.stages.artifacts import ensure_directory
     from tooltip_cli.stages.shelf.plan import part_of, read_shelf
-    from tooltip_cli.stages.shelf.run import plan_run
+    from tooltip_cli.stages.shelf.run import plan_run, prepare
+    from tooltip_cli.stages.shelf.store import place
 
     if dask not in (None, "local") and memory is not None:
         raise click.UsageError("--memory is for processes started here; Dask's workers have theirs")
@@ -140,23 +158,69 @@ def run(
     items, name = found.items, "results"
     if part is not None:
         items, name = part_of(items, *part), f"results.part-{part[0]}-of-{part[1]}"
-    out = out or found.out
-    plan = plan_run(
-        items,
-        out,
-        rig=rig,
-        topics=Topics(image=image, joints=joints, info=info, pose=pose),
-        params=EstimatorParams(method=method),
-        force=force,
-        verify=verify,
-    )
-    ensure_directory(out)  # before any work
+    results = found.out if out is None else place(out)
+    with progress(len(items), "plan, rows") as advance:
+        plan = plan_run(
+            items,
+            results,
+            rig=None if rig is None else place(rig),
+            topics=Topics(image=image, joints=joints, info=info, pose=pose),
+            params=EstimatorParams(method=method),
+            force=force,
+            verify=verify,
+            listing=found.listing,
+            on_row=advance,
+        )
+    prepare(plan, results / name)  # before any work
     engine = _engine(dask, jobs, _memory(memory, jobs))
-    rows = _carry_out(plan, engine, jobs, out / name, say if as_json else click.echo)
+    tell = say if as_json else click.echo
+    rows, summary = _carry_out(plan, engine, jobs, results / name, tell)
+    if report and part is None:
+        summary["report"] = _report(rows, results, tell)
     if as_json:
-        print_json(rows)
-    if rows["failed"]:
+        print_json(summary)
+    if summary["failed"]:
         ctx.exit(1)
+
+
+def _report(rows: Sequence[Row], results: Place, tell: Callable[[str], None]) -> str | None:
+    """Write the report over all rows and return where it is."""
+    from tooltip_cli.report.shelf_page import headline
+    from tooltip_cli.stages.shelf.summary import REPORT, cells_of, shelf_report, write_report
+
+    gathered = shelf_report(map(cells_of, rows), str(results))
+    try:
+        page = write_report(gathered, results / REPORT)
+    except MissingExtraError as error:
+        say(str(error))
+        return None
+    tell(headline(gathered))
+    tell(str(page))
+    return str(page)
+
+
+def evaluate_shelf(ctx: click.Context, shelf: str, as_json: bool, **options: Any) -> None:
+    """Write the report over a shelf: from its table of results, else after what is left to do."""
+    from tooltip_cli.stages.artifacts import plain
+    from tooltip_cli.stages.shelf import summary
+    from tooltip_cli.stages.shelf.store import place
+
+    path = place(shelf)
+    if path.suffix.lower() not in (".csv", ".parquet") or not summary.is_results(path):
+        ctx.invoke(run, shelf=shelf, as_json=as_json, **options)
+        return
+    out = options["out"]
+    folder = path.parent / summary.REPORT if out is None else place(out)
+    with progress(None, "rows") as advance:
+        gathered = summary.shelf_report(summary.stored_rows(path), str(path), advance)
+    page = summary.write_report(gathered, folder)
+    if as_json:
+        print_json(plain(gathered))
+    else:
+        from tooltip_cli.report.shelf_page import headline
+
+        click.echo(headline(gathered))
+        click.echo(str(page))
 
 
 def _engine(dask: str | None, jobs: int, memory_bytes: int) -> Engine:
@@ -178,10 +242,10 @@ def _memory(gib: float | None, jobs: int) -> int:
 
 
 def _carry_out(
-    plan: Plan, engine: Engine, jobs: int, table: Path, tell: Callable[[str], None]
-) -> dict[str, Any]:
-    """Do what is left, tell of each recording as it ends, and return the summary."""
-    from tooltip_cli.stages.shelf.run import carry_out, write_results
+    plan: Plan, engine: Engine, jobs: int, table: Place, tell: Callable[[str], None]
+) -> tuple[Sequence[Row], dict[str, Any]]:
+    """Do what is left, tell of each recording as it ends; return all rows and the summary."""
+    from tooltip_cli.stages.shelf.run import carry_out, in_order, write_results
 
     if plan.finished:
         say(f"{len(plan.finished)} of {len(plan.order)} recordings are finished already")
@@ -194,11 +258,11 @@ def _carry_out(
                 reused += outcome.reused
                 advance(outcome.row.name, partial(tell, _line(outcome.row, outcome.reused)))
     finally:
-        written = write_results(plan, rows, table)
-    everything = [*plan.finished.values(), *rows]
+        everything = in_order(plan, rows)
+        written = write_results(everything, table)
     summary = _summary(everything, reused, written)
     _tell_summary(summary, everything, tell)
-    return summary
+    return everything, summary
 
 
 def _line(row: Row, reused: bool) -> str:
@@ -214,7 +278,7 @@ def _line(row: Row, reused: bool) -> str:
     return f"{row.name}: {text} ({row.seconds or 0:.1f} s{how})"
 
 
-def _summary(rows: Sequence[Row], reused: int, written: Sequence[Path]) -> dict[str, Any]:
+def _summary(rows: Sequence[Row], reused: int, written: Sequence[Place]) -> dict[str, Any]:
     status = Counter(row.status for row in rows)
     return {
         "recordings": len(rows),

@@ -126,6 +126,8 @@ def decode_foreign(datatype: str, payload: bytes, source: str) -> Any:
     """
     try:
         return decode(datatype, payload)
+    except MemoryError:  # says nothing of the message: what it holds is bounded by its size
+        raise
     except Exception as error:  # the decoder meets arbitrary bytes
         raise TooltipError(
             f"{source}: a message is not a {datatype} ({error!r}); record it again, or leave the "

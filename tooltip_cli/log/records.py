@@ -127,7 +127,7 @@ def unpack(chunk: ChunkHead) -> bytes:
     """
     try:
         records = _unpacked(chunk)
-    except (zstandard.ZstdError, RuntimeError, MemoryError) as error:
+    except (zstandard.ZstdError, RuntimeError) as error:
         raise RecordError(f"a chunk cannot be unpacked ({error})") from error
     if len(records) != chunk.size:
         raise RecordError("a chunk has another size than it claims")

@@ -30,6 +30,8 @@ CORRECTED = "_corrected"
 MAX_GAP_NS = 100_000_000
 """Longest gap between joint samples that is bridged: a wrist turns some degrees in 0.1 s."""
 
+STORED_RIG = "attachment rig.yaml"  # how the source of a rig ends that the recording carries
+
 
 @dataclass(frozen=True)
 class Views:
@@ -68,7 +70,7 @@ def resolve_rig(recording: Recording, rig_path: Path | None) -> Rig:
             raise TooltipError(f"{recording.path}: the stored rig names '{name}', which is missing")
         return _text(stored[name], f"{recording.path}: attachment {name}")
 
-    return parse_rig(read("rig.yaml"), read, f"{recording.path}: attachment rig.yaml")
+    return parse_rig(read("rig.yaml"), read, f"{recording.path}: {STORED_RIG}")
 
 
 def _text(data: bytes, source: str) -> str:

@@ -13,6 +13,8 @@ from tooltip_cli.method.types import Array, Indices
 SPLIT_KINDS = ("random", "blocks")
 BOOTSTRAP_DRAWS = 2000
 _TEST_BLOCKS = 5
+_LEAST_BLOCKS = 5  # that an interval is drawn from, where there are as many errors
+_NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the normal distribution
 
 
 @dataclass(frozen=True)
@@ -130,15 +132,19 @@ def pixel_errors(predicted: Array, labelled: Array) -> Array:
     return np.asarray(np.linalg.norm(predicted - labelled, axis=1))
 
 
+def block_length(count: int) -> int:
+    """Return how many neighbouring frames are drawn together: they err alike."""
+    return max(1, min(round(2.0 * float(np.cbrt(count))), count // _LEAST_BLOCKS))
+
+
 def bootstrap_means(errors: Array, seed: int = 0, draws: int = BOOTSTRAP_DRAWS) -> Array:
     """Return (draws,) means of resampled (N,) errors, the errors in the order of their frames.
 
-    Blocks of about the cube root of N neighbours are drawn, around the end, because neighbouring
-    frames err alike and single draws would promise too narrow an interval (the moving-block
-    bootstrap of Kunsch 1989, circular as in Politis and Romano 1992).
+    Blocks of neighbours are drawn, around the end, because single draws would promise too narrow
+    an interval (the moving-block bootstrap of Kunsch 1989, circular as in Politis and Romano 1992).
     """
     count = len(errors)
-    length = max(1, round(count ** (1 / 3)))
+    length = block_length(count)
     rng = np.random.default_rng(seed)
     starts = rng.integers(0, count, size=(draws, -(-count // length)))
     chosen = (starts[:, :, None] + np.arange(length)).reshape(draws, -1)[:, :count] % count
@@ -148,12 +154,65 @@ def bootstrap_means(errors: Array, seed: int = 0, draws: int = BOOTSTRAP_DRAWS) 
 def bootstrap_interval(
     errors: Array, seed: int = 0, draws: int = BOOTSTRAP_DRAWS
 ) -> tuple[float, float] | None:
-    """Return the 95 % percentile-bootstrap interval of the mean; None below two errors."""
-    finite = errors[np.isfinite(errors)]
-    if len(finite) < 2:
-        return None
-    low, high = np.percentile(bootstrap_means(finite, seed, draws), [2.5, 97.5])
-    return float(low), float(high)
+    """Return the 95 % bootstrap interval of the mean of (N,) errors; None below two."""
+    gathered = MeanInterval(draws)
+    gathered.add(errors[np.isfinite(errors)], seed)
+    return gathered.interval()
+
+
+class MeanInterval:
+    """The 95 % interval of a mean, or of the mean of several tools' means.
+
+    Percentiles of bootstrap draws alone are too narrow where blocks are few: resampling K of them
+    shows K - 1 of K parts of the variance, and that is itself uncertain. So the draws are spread by
+    the first, and by Student's t against the normal for the second, with the degrees of freedom of
+    Welch (1947) where several tools are averaged.
+    """
+
+    def __init__(self, draws: int = BOOTSTRAP_DRAWS) -> None:
+        self._draws = np.zeros(draws)
+        self._center, self._least, self._most = 0.0, 0.0, 0.0  # sums over the tools
+        self._shown, self._variance, self._doubt = 0.0, 0.0, 0.0
+        self._tools = 0
+        self._narrow = True  # every tool has at least two errors
+
+    def add(self, errors: Array, seed: int) -> None:
+        """Add one tool's (N,) errors, finite and in the order of their frames."""
+        self._narrow &= len(errors) > 1
+        if not self._narrow:
+            return
+        means, blocks = bootstrap_means(errors, seed, len(self._draws)), _blocks_of(len(errors))
+        shown = float(means.var())
+        variance = shown * blocks / (blocks - 1)
+        self._draws += means
+        self._center += float(errors.mean())
+        self._least += float(errors.min())
+        self._most += float(errors.max())
+        self._shown += shown
+        self._variance += variance
+        self._doubt += variance**2 / (blocks - 1)
+        self._tools += 1
+
+    def interval(self) -> tuple[float, float] | None:
+        """Return the interval; None where a tool has fewer than two errors."""
+        if not self._narrow or not self._tools:
+            return None
+        low, high = np.percentile(self._draws, [2.5, 97.5])
+        if self._doubt > 0:
+            spread = self._t() / _NORMAL_95 * np.sqrt(self._variance / self._shown)
+            low, high = self._center + spread * (np.array([low, high]) - self._center)
+        # no resampling leaves the range of the errors
+        low, high = np.clip([low, high], self._least, self._most) / self._tools
+        return float(low), float(high)
+
+    def _t(self) -> float:
+        from scipy.special import stdtrit
+
+        return float(stdtrit(self._variance**2 / self._doubt, 0.975))
+
+
+def _blocks_of(count: int) -> float:
+    return count / block_length(count)
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,7 @@ class Candidate:
     covariance: Array | None = None  # (3, 3) m^2; None: not known for this place
     axis: Array | None = None  # (3,) unit vector out of the tool's end, hand frame
     axis_std: float | None = None  # rad, standard deviation of its direction either way
+    agreement: float | None = None  # share of the images that agree on it; None: too few show it
 
 
 @dataclass(frozen=True)

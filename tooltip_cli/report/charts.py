@@ -25,6 +25,7 @@ _Made = TypeVar("_Made")
 
 INK, MUTED, GRID, PAPER = "#1b1f24", "#59636e", "#d5dae0", "#fefefe"
 DETECTOR, BASELINE, DETECTION, TRUTH = "#1f62b0", "#c4501b", "#6b4fa8", "#1a7f4b"
+CLOCK = "#8a6d00"
 _VARIABLES = {
     INK: "ink",
     MUTED: "muted",
@@ -34,6 +35,7 @@ _VARIABLES = {
     BASELINE: "baseline",
     DETECTION: "detection",
     TRUTH: "truth",
+    CLOCK: "clock",
 }
 WIDTH_IN = 3.8  # a journal's column and a phone's screen: text stays readable on both
 PRINT_DPI = 300
@@ -118,8 +120,14 @@ class Chart:
         return self.canvas.subplots(rows, columns, **options)
 
     def legend_above(self, columns: int) -> None:
-        """Put the legend above the axes, where it hides nothing; it takes 0.25 inches."""
+        """Put the legend above the axes, where it hides nothing; each row takes 0.18 inches."""
+        from matplotlib.container import Container
+
+        handles, labels = self.canvas.axes[0].get_legend_handles_labels()
+        order = sorted(range(len(handles)), key=lambda at: not isinstance(handles[at], Container))
         self.canvas.legend(
+            [handles[at] for at in order],
+            [labels[at] for at in order],
             loc="upper left",
             bbox_to_anchor=(0.0, 1.0),
             borderaxespad=0.1,
@@ -199,7 +207,7 @@ def inline_svg(text: str, alt: str) -> str:
     )
     for color, name in _VARIABLES.items():
         body = body.replace(color, f"var(--{name})")
-    body = body.replace("'DejaVu Sans', ", "")
+    body = body.replace("'DejaVu Sans', sans-serif", "var(--font)")
     return f"{head}>{body.strip()}"
 
 

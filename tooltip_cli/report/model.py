@@ -32,7 +32,8 @@ class CandidateScore:
 
     position_m: Vector
     support: float  # share of the evidence, 0 to 1
-    axis: Vector | None  # unit vector along the tool, where the method states one
+    axis: Vector | None  # unit vector out of the tool's end, where the method states one
+    axis_deg: float | None  # standard deviation of its direction either way
     error_px: float | None  # mean over the scored test frames
     tip_error_mm: float | None  # distance to the true tip
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tooltip_cli.method.evaluation import BOOTSTRAP_DRAWS, ErrorSummary, bootstrap_means
+from tooltip_cli.method.evaluation import ErrorSummary, MeanInterval
 from tooltip_cli.method.types import Array
 from tooltip_cli.report.model import FrameTable, Histogram, Overall, RecordingReport
 
@@ -19,8 +19,7 @@ class MeanOfTools:
     """The mean over tools of their mean errors, each tool's frames resampled for the interval."""
 
     means: list[float] = field(default_factory=list)
-    _draws: Array = field(default_factory=lambda: np.zeros(BOOTSTRAP_DRAWS))
-    _narrow: bool = True  # every tool has at least two frames
+    _interval: MeanInterval = field(default_factory=MeanInterval)
 
     def add(self, errors: Array, seed: int) -> None:
         """Add one tool by its frames' errors, in the order of the frames."""
@@ -28,15 +27,14 @@ class MeanOfTools:
         if not len(finite):
             return
         self.means.append(float(finite.mean()))
-        self._narrow &= len(finite) > 1
-        self._draws += bootstrap_means(finite, seed)
+        self._interval.add(finite, seed)
 
     def summary(self) -> ErrorSummary | None:
         """Return statistics over the tools; the interval is that of the mean over these tools."""
         if not self.means:
             return None
         values = np.array(self.means)
-        low, high = np.percentile(self._draws / len(values), [2.5, 97.5])
+        low, high = self._interval.interval() or (None, None)
         return ErrorSummary(
             len(values),
             float(values.mean()),
@@ -44,8 +42,8 @@ class MeanOfTools:
             float(np.sqrt(np.square(values).mean())),
             float(np.percentile(values, 95)),
             float(values.max()),
-            float(low) if self._narrow else None,
-            float(high) if self._narrow else None,
+            low,
+            high,
         )
 
 

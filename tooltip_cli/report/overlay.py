@@ -62,12 +62,16 @@ class Window:
         return np.ascontiguousarray(part)
 
 
-def cross(u: float, v: float, size: float, color: str, width: float = 1.5) -> list[Shape]:
-    """Return a cross of this size, measured across."""
+def cross(
+    u: float, v: float, size: float, color: str, width: float = 1.5, gap: float = 0.0
+) -> list[Shape]:
+    """Return a cross of this size, measured across, with a gap of that size in its middle."""
     half = size / 2
+    arms = ((-half, -gap / 2), (gap / 2, half)) if gap else ((-half, half),)
     return [
-        Line(u - half, v, u + half, v, color, width),
-        Line(u, v - half, u, v + half, color, width),
+        Line(u + near * du, v + near * dv, u + far * du, v + far * dv, color, width)
+        for near, far in arms
+        for du, dv in ((1, 0), (0, 1))
     ]
 
 

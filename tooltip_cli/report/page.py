@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from importlib import resources
 from typing import Any
 
+from tooltip_cli.log.views import STORED_RIG
 from tooltip_cli.method.evaluation import ErrorSummary
 from tooltip_cli.report import words
 from tooltip_cli.report.charts import Drawing, escape
+from tooltip_cli.report.document import head, packaged, table_rows
 from tooltip_cli.report.model import EvaluationReport, RecordingReport, mean_of
 from tooltip_cli.report.section import anchor, figure_html, grid
 
-_POLICY = (
-    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
-    "base-uri 'none'; form-action 'none'"
-)
+_NAMED = 4  # tools in the title
 
 
 def page(
@@ -33,25 +31,10 @@ def page(
         left_out: names of the others.
     """
     names = [row.name for row in report.recordings]
-    title = "Tool tips: " + ", ".join(names[:4]) + (" ..." if len(names) > 4 else "")
-    yield f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="{_POLICY}">
-<meta name="color-scheme" content="light dark">
-<title>{escape(title)}</title>
-<style>
-{_resource("page.css")}</style>
-</head>
-<body>
-<header>
-<h1>{escape(title)}</h1>
-<p class="lead">{escape(words.headline(report))}</p>
-</header>
-<main>
-<section aria-labelledby="summary"><h2 id="summary">Summary</h2>
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    title = "Tool tips: " + ", ".join(names[:_NAMED]) + more
+    yield head(title, words.headline(report))
+    yield f"""<section aria-labelledby="summary"><h2 id="summary">Summary</h2>
 {_tool_table(report, left_out)}
 {_failures(report)}</section>
 """
@@ -78,21 +61,10 @@ everything it shows; links to figures, tables and frames need the folder it was 
 <form method="dialog"><h2 id="viewer-title">Frame</h2><button>Close</button></form>
 <div id="viewer-picture"></div></dialog>
 <script>
-{_resource("page.js")}</script>
+{packaged("page.js")}</script>
 </body>
 </html>
 """
-
-
-def _resource(name: str) -> str:
-    return resources.files("tooltip_cli.report").joinpath(name).read_text(encoding="utf-8")
-
-
-def _rows(body: Iterable[Sequence[str]]) -> Iterable[str]:
-    """Yield table rows; cells are HTML, the first names the row."""
-    for first, *rest in body:
-        cells = "".join(f"<td>{cell}</td>" for cell in rest)
-        yield f'<tr><th scope="row">{first}</th>{cells}</tr>\n'
 
 
 def _tool_table(report: EvaluationReport, left_out: Sequence[str]) -> str:
@@ -139,7 +111,7 @@ def _tool_table(report: EvaluationReport, left_out: Sequence[str]) -> str:
             "between the two [mm]",
             "frames",
         ),
-        _rows(rows),
+        table_rows(rows),
     )
 
 
@@ -182,15 +154,16 @@ def _provenance(report: EvaluationReport) -> str:
             continue
         keys = [score.key[:12] for score in (row.detector, row.baseline) if score is not None]
         labels = "-" if row.labels is None else f"{row.labels.file} {row.labels.digest[:12]}"
-        rig = origin["rig"]
+        rig, made = origin["rig"], str(origin["created"])[:16].replace("T", " ")
+        source = "in the recording" if rig["source"].endswith(STORED_RIG) else rig["source"]
         values = (
             row.recording,
             f"{row.sha256[:12]}...",
             labels,
-            f"{rig['source']} (offset {1000 * rig['time_offset_s']:g} ms)",
+            f"{source}, offset {1000 * rig['time_offset_s']:g} ms",
             f"{origin['detections_key'][:12]}...",
             " ".join(keys),
-            f"{origin['version']}, {origin['created']}",
+            f"{origin['version']}, {made}",
         )
         rows.append([escape(row.name), *(f"<code>{escape(value)}</code>" for value in values)])
     options = "".join(
@@ -200,7 +173,7 @@ def _provenance(report: EvaluationReport) -> str:
     table = grid(
         "Where every number comes from",
         ("tool", "recording", "SHA-256", "labels", "rig", "detections", "estimates", "version"),
-        _rows(rows),
+        table_rows(rows),
     )
     files = " ".join(
         f'<a href="{name}">{name}</a>'

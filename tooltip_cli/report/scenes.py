@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,12 +21,22 @@ from tooltip_cli.report.overlay import Circle, Image, Line, Shape, Window
 from tooltip_cli.report.scoring import project_tip
 from tooltip_cli.report.tables import csv_text, number
 
+_GAP_PX = 10  # in the middle of that cross, where circle and dot are
 CROSS_PX = 40  # Figure 5: "measures 40 pixels across for scale"
 _OTHERS = "Green rings: the other candidates, which the data cannot tell apart."
 _DOT_PX = 2  # radius of the edges that move
 _COLORS = np.array(  # from slow to fast, BGR; told apart by brightness too
     [[110, 80, 50], [190, 90, 150], [110, 110, 245], [60, 190, 255], [190, 255, 255]], dtype=float
 )
+
+
+@dataclass(frozen=True)
+class VotedShape:
+    """What voting sees of hand and tool, coarsely."""
+
+    points: Array  # (P, 3) metres, hand frame
+    shares: Array  # (P,) of the frames that agree on each
+    frames: int  # that it was reconstructed from
 
 
 @dataclass(frozen=True)
@@ -40,6 +50,7 @@ class Scene:
     estimator: EstimatorParams
     split: Split
     labels: MatchedLabels | None
+    shape: Callable[[], VotedShape | None]  # takes a second where it is not stored; None: no voting
 
 
 def typical(row: RecordingReport, table: FrameTable) -> int | None:
@@ -84,15 +95,22 @@ def _prediction(
     row: RecordingReport, table: FrameTable, place: int, image: Image, scene: Scene
 ) -> Drawing:
     scale = image.shape[1] / 640  # marks keep their weight on larger images
+    low, high = np.zeros(2), np.array(image.shape[1::-1]) - 1.0
     mean = mean_of(row.detector_px)
     shapes: list[Shape] = []
     (u, v), (x, y) = table.prediction[place], table.label[place]
     if np.isfinite(u):
-        shapes += overlay.cross(u, v, CROSS_PX, overlay.WHITE, 2 * scale)
+        shapes += overlay.cross(u, v, CROSS_PX, overlay.WHITE, scale, gap=_GAP_PX)
         if mean is not None:
-            shapes.append(Circle(u, v, mean, overlay.WHITE, 2 * scale))
+            shapes.append(Circle(u, v, mean, overlay.WHITE, 0.8 * scale))
     if np.isfinite(x):
-        shapes.append(Circle(x, y, 3 * scale, overlay.WHITE, filled=True))
+        shapes.append(Circle(x, y, 1.3 * scale, overlay.WHITE, filled=True))
+    reach = CROSS_PX / 2 if mean is None else max(CROSS_PX / 2, mean)
+    spots = np.array([(u - reach, v - reach), (u + reach, v + reach), (x, y)])
+    corners = np.clip(spots[np.isfinite(spots).all(axis=1)], low, high)
+    window = overlay.whole(image)
+    if len(corners):
+        window = overlay.window_around(corners, image, image.shape[1] // 4)
     words = f"Frame {table.frames[place]}"
     key = [f"Cross ({CROSS_PX} px across): the prediction."] if np.isfinite(u) else []
     if not np.isfinite(u):
@@ -109,10 +127,10 @@ def _prediction(
     return overlay.drawing(
         f"{row.name}-prediction",
         "Example prediction",
-        f"Camera image of {row.name}. {words}.",
+        f"Part of a camera image of {row.name} around the tip. {words}.",
         " ".join([f"{words}.", *key, "(Figure 5 of the paper.)"]),
         image,
-        overlay.whole(image),
+        window,
         [*shapes, *others],
         _marks(table, place, {"mean_error_px": mean}),
     )

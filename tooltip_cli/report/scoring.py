@@ -31,7 +31,7 @@ from tooltip_cli.rig.kinematics import inverse_transform
 TRUTH = "truth.json"
 SIMULATOR = "sim"  # the labeler of simulated labels
 UNLABELLED = "unlabelled"
-_CHI2_95_3D = 7.814727903251179  # 95 % quantile of chi squared with three degrees of freedom
+CHI2_95_3D = 7.814727903251179  # 95 % quantile of chi squared with three degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ def score_estimate(
     offset = None if position is None or truth is None else position - truth.tip_hand
     inside = None
     if offset is not None and covariance is not None:
-        inside = bool(offset @ np.linalg.pinv(covariance) @ offset <= _CHI2_95_3D)
+        inside = bool(offset @ np.linalg.pinv(covariance) @ offset <= CHI2_95_3D)
     return EstimateScore(
         source=source,
         status=estimate.status,
@@ -222,12 +222,13 @@ def _score_candidate(
     item: Mapping[str, Any], views: Views, table: FrameTable, truth: Truth | None
 ) -> CandidateScore:
     position = np.array(item["position_m"], dtype=float)
-    axis = item.get("axis")
+    axis, axis_deg = item.get("axis"), item.get("axis_std_deg")
     error = summarize(pixel_errors(project_tip(views, position, table.frames), table.label))
     return CandidateScore(
         position_m=vector(position),
         support=float(item["support"]),
         axis=None if axis is None else vector(np.array(axis, dtype=float)),
+        axis_deg=None if axis_deg is None else float(axis_deg),
         error_px=None if error is None else error.mean,
         tip_error_mm=(
             None if truth is None else float(1000 * np.linalg.norm(position - truth.tip_hand))
@@ -242,7 +243,7 @@ def _region(
     if covariance is None:
         return None, None
     values, vectors = np.linalg.eigh(covariance)
-    lengths = 1000 * np.sqrt(_CHI2_95_3D * np.maximum(values, 0.0))
+    lengths = 1000 * np.sqrt(CHI2_95_3D * np.maximum(values, 0.0))
     return vector(lengths[::-1]), _rows(vectors.T[::-1])
 
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from tooltip_cli.report import words
 from tooltip_cli.report.charts import Drawing, escape
-from tooltip_cli.report.model import ErrorShares, FrameTable, RecordingReport
+from tooltip_cli.report.model import ErrorShares, EstimateScore, FrameTable, RecordingReport
 from tooltip_cli.report.scenes import by_severity
 
-_STRIP = 6  # the worst frames, shown without opening the table
+_STRIP = 8  # the worst frames, shown without opening the table
 _FILES = {"svg": "SVG", "png": "PNG", "csv": "data"}
 _AUDIT_COLUMNS = (
     "frame",
@@ -77,7 +77,8 @@ def recording_section(
     """
     judged = words.verdict(row)
     name, place = escape(row.name), anchor(row.name)
-    shares = "" if row.shares is None else _shares(row.shares)
+    nearest = None if row.detector is None else row.detector.nearest_px
+    shares = "" if row.shares is None else _shares(row.shares, nearest)
     notes = "".join(f"<li>{escape(words.sentence(note))}</li>" for note in row.notes)
     return f"""<section aria-labelledby="tool-{place}" class="tool">
 <h2 id="tool-{place}">{name} <span class="chip {judged.level}">{escape(judged.short)}</span></h2>
@@ -100,10 +101,10 @@ def _facts(row: RecordingReport) -> Iterable[tuple[str, str]]:
     if detector is not None and detector.position_m is not None:
         yield "Tip in the hand frame", words.position_words(detector)
         yield "95 % region", words.region_words(detector)
-        for text in words.candidate_words(detector):
-            yield "Candidates", text
-    for reason in row.reasons:
-        yield reason.code.replace("_", " ").capitalize(), words.sentence(reason.text)
+        axis = words.axis_words(detector)
+        if axis is not None:
+            yield "Tool's axis, out of its end", axis
+        yield from _candidates(row, detector)
     if row.baseline is not None:
         yield "Tip from labels", words.position_words(row.baseline)
     if detector is not None:
@@ -130,7 +131,18 @@ def _facts(row: RecordingReport) -> Iterable[tuple[str, str]]:
         )
 
 
-def _shares(shares: ErrorShares) -> str:
+def _candidates(row: RecordingReport, detector: EstimateScore) -> Iterable[tuple[str, str]]:
+    if detector.ambiguous:
+        for which, end in enumerate(detector.candidates, start=1):
+            command = words.prefer_command(row, end)
+            yield f"End {which}", f"{words.end_words(end)}. To take it: {command}"
+    elif len(detector.candidates) > 1:
+        first, second = detector.candidates[:2]
+        text = f"support {first.support:.0%}; the next best has {second.support:.0%}"
+        yield "Candidates", text
+
+
+def _shares(shares: ErrorShares, nearest_px: float | None) -> str:
     parts = (
         ("detection", shares.detection_px, "detection"),
         ("clock", shares.clock_px, "synchronisation"),
@@ -150,7 +162,7 @@ def _shares(shares: ErrorShares) -> str:
         bar = f'<div class="bar" aria-hidden="true">{bar}</div><ul class="key">{key}</ul>'
     return (
         f'<div class="shares"><h3>Where the error comes from</h3>{bar}'
-        f"<p>{escape(words.share_words(shares))}</p></div>"
+        f"<p>{escape(words.share_words(shares, nearest_px))}</p></div>"
     )
 
 

@@ -1,14 +1,15 @@
 """Figure 4: rays, hypothesised intersections, clusters and the tip in the hand frame.
 
-Two panels: training by detection, test by label. The page turns them in the browser; the printed
-figure shows the same things from the side on which the rays fan out.
+Panels: what voting saw of hand and tool, where it did; training by detection; test by label. The
+page turns them in the browser; the printed figure shows the same things from the side on which the
+rays fan out.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,8 @@ from tooltip_cli.method.estimators import EstimatorParams
 from tooltip_cli.method.kmeans import nearest
 from tooltip_cli.method.rays import intersections, plausible, rays_in_hand, sphere_array
 from tooltip_cli.method.types import Array, Indices, Rays, TipPixels
+from tooltip_cli.method.voting.estimate import METHOD as VOTING
+from tooltip_cli.report import words
 from tooltip_cli.report.charts import (
     BASELINE,
     DETECTOR,
@@ -30,6 +33,7 @@ from tooltip_cli.report.charts import (
 )
 from tooltip_cli.report.model import EstimateScore, RecordingReport
 from tooltip_cli.report.scenes import Scene
+from tooltip_cli.report.tables import number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,6 +49,7 @@ CLUSTER_COLORS = (  # told apart by most kinds of colour vision (Okabe and Ito),
     "#8a8a8a",
 )
 _MOST_RAYS, _MOST_POINTS = 160, 600
+_AXIS_M = (0.06, 0.02)  # how far back from a tip its axis is drawn, and how far beyond it
 _SEED = 0  # of which rays and points are shown where there are more
 
 
@@ -60,6 +65,20 @@ class Panel:
     estimate: EstimateScore | None
     rays: int  # before thinning out
     hypotheses: int
+    shares: Array | None = None  # (M,) where points are what was voted: frames that agree on each
+    frames: int = 0  # that voted
+
+    @property
+    def words(self) -> str:
+        """What is drawn, with numbers."""
+        if self.shares is not None:
+            return f"{self.title}: {len(self.points)} places, from {self.frames} frames"
+        thinned = (
+            f" ({len(self.starts)} and {len(self.points)} of them drawn)"
+            if len(self.starts) < self.rays or len(self.points) < self.hypotheses
+            else ""
+        )
+        return f"{self.title}: {self.rays} rays, {self.hypotheses} intersections{thinned}"
 
 
 @styled
@@ -67,71 +86,86 @@ def rays_figure(row: RecordingReport, scene: Scene) -> Drawing | None:
     """Return Figure 4; None where no ray is known."""
     pixels = scene.detections.tip_pixels()
     train = pixels.select(np.isin(pixels.frames, scene.split.train))
+    labels = None if scene.labels is None else scene.labels.visible
     center, radius = _frame(row)
     panels = [
+        _voted(row, scene, center, radius),
         _panel("training, by detection", train, row.detector, scene, center, radius),
-        _panel(
-            "test, by label",
-            scene.labels.visible if scene.labels is not None else None,
-            row.baseline,
-            scene,
-            center,
-            radius,
-        ),
+        _panel("test, by label", labels, row.baseline, scene, center, radius),
     ]
     shown = [panel for panel in panels if panel is not None]
     if not shown:
         return None
-    basis = _basis(shown[-1], row)
+    basis = _basis(shown[-1])
     spheres = sphere_array([(item.center, item.radius) for item in scene.views.spheres])
-    chart = Chart(3.5, 3.5 * len(shown), left=0.42, right=0.1, top=0.25, bottom=0.28)
-    chart.canvas.subplots_adjust(wspace=0.16)
+    side = 3.5 if len(shown) < len(panels) else 2.6  # inches
+    chart = Chart(side, side * len(shown), left=0.42, right=0.1, top=0.25, bottom=0.28)
+    chart.canvas.subplots_adjust(wspace=0.18)
     grid = np.atleast_1d(chart.axes(1, len(shown)))
     for axes, panel in zip(grid, shown, strict=True):
         _draw(axes, panel, basis, center, radius, spheres, row)
-    truth = "" if row.truth_m is None else "; diamond: the true tip"
-    method = "" if row.detector is None else row.detector.method
-    beyond = ""
-    if method not in ("", "kmeans"):
-        beyond = (
-            f" The method {method} does not cluster these intersections; they are for comparison."
-        )
-    words = "; ".join(f"{panel.title}: {_panel_words(panel)}" for panel in shown)
+    text = "; ".join(panel.words for panel in shown)
     drawing = chart.drawing(
         f"{row.name}-rays",
-        "Rays, intersections and the tip in the hand frame",
-        f"Viewing rays of {row.name} in the hand frame, seen from the side. {words}.",
-        f"{words[:1].upper()}{words[1:]}. Coloured points: hypothesised intersections of pairs of "
-        "rays, by the nearest candidate (blue: the estimate's). Large circles: the hand and wrist, "
-        "where no tip can be. Ring with cross: the estimate, with its 95 % region; small rings: "
-        f"other candidates{truth}.{beyond} (Figure 4 of the paper.)",
-        ("panel", "kind", "cluster", "x1_m", "y1_m", "z1_m", "x2_m", "y2_m", "z2_m"),
+        "The tip in the hand frame",
+        f"Hand, tool and viewing rays of {row.name} in the hand frame, seen from the side. {text}.",
+        f"{words.sentence(text)} {_key(row, shown)}",
+        ("panel", "kind", "cluster", "share", "x1_m", "y1_m", "z1_m", "x2_m", "y2_m", "z2_m"),
         [line for panel in shown for line in _rows(panel)],
     )
     payload = json.dumps(_payload(shown, basis, center, radius, spheres, row)).replace("<", "")
-    inline = (
-        f'<div class="turn">{drawing.inline}'
-        f'<script type="application/json">{payload}</script></div>'
-    )
-    return Drawing(
-        drawing.name,
-        drawing.title,
-        drawing.alt,
-        drawing.caption,
-        drawing.svg,
-        drawing.png,
-        drawing.data,
-        inline,
-    )
+    script = f'<script type="application/json">{payload}</script>'
+    return replace(drawing, inline=f'<div class="turn">{drawing.inline}{script}</div>')
 
 
-def _panel_words(panel: Panel) -> str:
-    thinned = (
-        f" ({len(panel.starts)} and {len(panel.points)} of them drawn)"
-        if len(panel.starts) < panel.rays or len(panel.points) < panel.hypotheses
-        else ""
+def _key(row: RecordingReport, panels: Sequence[Panel]) -> str:
+    """Say what the marks mean."""
+    parts = []
+    if any(panel.shares is not None for panel in panels):
+        parts.append(
+            "Grey points: places that move with the hand, darker where more frames agree; this is "
+            "what the estimate was voted from."
+        )
+    if any(panel.shares is None for panel in panels):
+        parts.append(
+            "Coloured points: hypothesised intersections of pairs of rays, by the nearest "
+            "candidate (blue: the estimate's)."
+        )
+    if row.detector is not None and row.detector.method == VOTING:
+        parts.append("Voting does not use these intersections; they are for comparison.")
+    parts.append(
+        "Large circles: the hand and wrist, where no tip can be. Ring with cross: the estimate, "
+        "with its 95 % region and, where known, the tool's axis. Small rings: other candidates."
     )
-    return f"{panel.rays} rays, {panel.hypotheses} intersections{thinned}"
+    if row.truth_m is not None:
+        parts.append("Green diamond: the true tip.")
+    if row.detector is not None and row.detector.ambiguous:
+        parts.append(
+            "The tool has several ends; select one, in the view or by its button, to see the "
+            "command that takes it."
+        )
+    return " ".join([*parts, "(Figure 4 of the paper.)"])
+
+
+def _voted(row: RecordingReport, scene: Scene, center: Array, radius: float) -> Panel | None:
+    """Return the panel of what voting saw; None where nothing was voted."""
+    shape = scene.shape()
+    if shape is None or not len(shape.points):
+        return None
+    near = np.linalg.norm(shape.points - center, axis=1) < 1.5 * radius
+    points, nobody = shape.points[near], np.zeros((0, 3))
+    return Panel(
+        "what moves with the hand",
+        nobody,
+        nobody,
+        points,
+        np.zeros(len(points), np.intp),
+        row.detector,
+        0,
+        len(points),
+        shape.shares[near],
+        shape.frames,
+    )
 
 
 def _frame(row: RecordingReport) -> tuple[Array, float]:
@@ -142,7 +176,11 @@ def _frame(row: RecordingReport) -> tuple[Array, float]:
         if score is not None and score.position_m is not None
     ]
     tip = known[-1] if known else np.zeros(3)
-    return tip / 2, max(0.12, 0.85 * float(np.linalg.norm(tip)))
+    radius = max(0.12, 0.85 * float(np.linalg.norm(tip)))
+    if row.detector is not None and row.detector.ambiguous:  # all ends are shown
+        places = np.array([item.position_m for item in row.detector.candidates])
+        radius = max(radius, 1.2 * float(np.linalg.norm(places - tip / 2, axis=1).max()))
+    return tip / 2, radius
 
 
 def viewing_rays(views: Views, pixels: TipPixels) -> Rays:
@@ -183,8 +221,10 @@ def _panel(
     )
 
 
-def _basis(panel: Panel, row: RecordingReport) -> Array:
+def _basis(panel: Panel) -> Array:
     """Return (3, 3) rows right, up and towards the viewer: the rays fan out in the picture."""
+    if not len(panel.starts):
+        return np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     directions = panel.ends - panel.starts
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     mean = directions.mean(axis=0)
@@ -207,6 +247,7 @@ def _draw(
     row: RecordingReport,
 ) -> None:
     from matplotlib.collections import LineCollection
+    from matplotlib.colors import to_rgba_array
     from matplotlib.patches import Circle
 
     def flat(points: Array) -> Array:
@@ -217,23 +258,63 @@ def _draw(
     for place, *_, size in [(flat(s[:3]), s[3] * 1000) for s in spheres]:
         axes.add_patch(Circle(tuple(place), size, fill=False, edgecolor=MUTED, linewidth=1.0))
     dots = flat(panel.points)
-    colors = [CLUSTER_COLORS[index % len(CLUSTER_COLORS)] for index in panel.clusters]
-    axes.scatter(dots[:, 0], dots[:, 1], s=2.5, c=colors, linewidths=0, rasterized=True)
+    if panel.shares is None:
+        colors = [CLUSTER_COLORS[index % len(CLUSTER_COLORS)] for index in panel.clusters]
+        axes.scatter(dots[:, 0], dots[:, 1], s=2.5, c=colors, linewidths=0, rasterized=True)
+    else:
+        axes.scatter(
+            dots[:, 0],
+            dots[:, 1],
+            s=3.5,
+            c=to_rgba_array(MUTED, shades(panel.shares)),
+            linewidths=0,
+            rasterized=True,
+        )
     _draw_axes(axes, flat)
     if panel.estimate is not None and panel.estimate.position_m is not None:
-        place = flat(np.array(panel.estimate.position_m))
-        axes.plot(
-            *place, marker="o", markersize=11, color=INK, fillstyle="none", markeredgewidth=1.4
-        )
-        axes.plot(*place, marker="+", markersize=11, color=INK, markeredgewidth=1.0)
-        for loop in region_loops(panel.estimate):
-            axes.plot(*flat(loop).T, color=BASELINE, linewidth=0.9)
+        _draw_estimate(axes, panel.estimate, flat)
     if row.truth_m is not None:
         axes.plot(*flat(np.array(row.truth_m)), marker="D", markersize=4.5, color=TRUTH)
     reach = 1000 * radius
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
     axes.set_title(f"{panel.title} (mm)", fontsize=8.5)
     axes.grid(False)
+
+
+def shades(shares: Array) -> Array:
+    """Return (P,) opacities: the places that most frames agree on are the darkest."""
+    most = float(np.quantile(shares, 0.95)) if len(shares) else 1.0
+    return np.asarray(0.2 + 0.8 * np.clip(shares / max(most, 1e-9), 0.0, 1.0))
+
+
+def axis_ends(score: EstimateScore) -> Array | None:
+    """Return (2, 3) the ends of the line that shows the tool's axis; None: not known."""
+    first = score.candidates[0] if score.candidates else None
+    if first is None or first.axis is None:
+        return None
+    back, beyond = _AXIS_M
+    tip, along = np.array(first.position_m), np.array(first.axis)
+    return np.stack([tip - back * along, tip + beyond * along])
+
+
+def _draw_estimate(axes: Axes, estimate: EstimateScore, flat: Any) -> None:
+    along = axis_ends(estimate)
+    if along is not None:
+        axes.plot(*flat(along).T, color=DETECTOR, linewidth=1.1, linestyle=(0, (4, 2)))
+    place = flat(np.array(estimate.position_m))
+    axes.plot(*place, marker="o", markersize=11, color=INK, fillstyle="none", markeredgewidth=1.4)
+    axes.plot(*place, marker="+", markersize=11, color=INK, markeredgewidth=1.0)
+    for loop in region_loops(estimate):
+        axes.plot(*flat(loop).T, color=BASELINE, linewidth=0.9)
+    if not estimate.ambiguous:
+        return
+    for which, item in enumerate(estimate.candidates, start=1):
+        spot = flat(np.array(item.position_m))
+        if which > 1:
+            axes.plot(*spot, marker="o", markersize=8, color=INK, fillstyle="none")
+        axes.annotate(
+            str(which), tuple(spot), fontsize=8, xytext=(7, 3), textcoords="offset points"
+        )
 
 
 def _draw_axes(axes: Axes, flat: Any) -> None:
@@ -262,21 +343,35 @@ def _rows(panel: Panel) -> list[list[str]]:
         return [f"{value:.5f}" for point in points for value in point]
 
     rays = [
-        [panel.title, "ray", "", *cells(start, end)]
+        [panel.title, "ray", "", "", *cells(start, end)]
         for start, end in zip(panel.starts, panel.ends, strict=True)
     ]
+    kind = "intersection" if panel.shares is None else "voted"
     points = [
-        [panel.title, "intersection", str(int(cluster)), *cells(point), "", "", ""]
+        [panel.title, kind, str(int(cluster)), "", *cells(point), "", "", ""]
         for point, cluster in zip(panel.points, panel.clusters, strict=True)
     ]
+    for line, share in zip(points, [] if panel.shares is None else panel.shares, strict=False):
+        line[2:4] = ["", number(float(share), 3)]
     estimate = panel.estimate
     if estimate is None or estimate.position_m is None:
         return rays + points
-    return [
-        *rays,
-        *points,
-        [panel.title, "estimate", "0", *cells(np.array(estimate.position_m)), "", "", ""],
+    places = [np.array(item.position_m) for item in estimate.candidates]
+    places = places or [np.array(estimate.position_m)]
+    candidates = [
+        [
+            panel.title,
+            "candidate" if index else "estimate",
+            str(index),
+            "",
+            *cells(place),
+            "",
+            "",
+            "",
+        ]
+        for index, place in enumerate(places)
     ]
+    return [*rays, *points, *candidates]
 
 
 def _payload(
@@ -296,16 +391,22 @@ def _payload(
         estimate = panel.estimate
         known = estimate is not None and estimate.position_m is not None
         others = [] if estimate is None else estimate.candidates[1:]
+        along = None if estimate is None else axis_ends(estimate)
+        shares = panel.shares
         return {
             "title": panel.title,
             "rays": whole(np.concatenate([panel.starts, panel.ends], axis=1)),
             "points": whole(panel.points),
             "clusters": [int(value) for value in panel.clusters],
+            "shades": None if shares is None else [int(v) for v in np.round(100 * shades(shares))],
             "tip": whole(np.array(estimate.position_m)) if estimate and known else None,
+            "axis": None if along is None else whole(along),
             "others": [whole(np.array(item.position_m)) for item in others],
             "region": [whole(loop) for loop in region_loops(estimate)] if estimate else [],
+            "ends": bool(estimate and estimate.source == "detections" and estimate.ambiguous),
         }
 
+    ends = row.detector.candidates if row.detector and row.detector.ambiguous else ()
     return {
         "radius": round(1000 * radius),
         "basis": [round(float(value), 5) for value in basis.ravel()],
@@ -315,4 +416,12 @@ def _payload(
         "truth": None if row.truth_m is None else whole(np.array(row.truth_m)),
         "colors": [*CLUSTER_COLORS],
         "panels": [panel_data(panel) for panel in panels],
+        "ends": [
+            {
+                "at": whole(np.array(item.position_m)),
+                "text": words.end_words(item),
+                "command": words.prefer_command(row, item),
+            }
+            for item in ends
+        ],
     }

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from tooltip_cli.log.views import STORED_RIG
 from tooltip_cli.method.evaluation import ErrorSummary
 from tooltip_cli.report.model import (
+    CandidateScore,
     ErrorShares,
     EstimateScore,
     EvaluationReport,
@@ -17,6 +20,7 @@ from tooltip_cli.report.model import (
 )
 
 PERFECT_PX = 0.5  # nobody labels better than this
+_COUNTED = 20  # times the baseline's error, above which their number says little
 AS_GOOD, CLOSE = 1.25, 2.0  # times the baseline's error
 
 
@@ -43,7 +47,8 @@ def verdict(row: RecordingReport) -> Verdict:
     times = detector / baseline if baseline > 0 else float("inf")
     text = (
         f"The tip estimated from detections projects {detector:.1f} px from the labels on "
-        f"average, {times:.1f} times the baseline's {baseline:.1f} px."
+        f"average, {times:.{1 if times < _COUNTED else 0}f} times the baseline's "
+        f"{baseline:.1f} px."
     )
     # an estimate with status ok may carry reservations
     text = " ".join([text, *(sentence(reason.text) for reason in row.reasons)])
@@ -54,7 +59,8 @@ def verdict(row: RecordingReport) -> Verdict:
         return Verdict("good", "as good as labels", text)
     if times <= CLOSE:
         return Verdict("fair", f"near: {times:.1f} × labels", text)
-    return Verdict("poor", f"off: {times:.1f} × labels", text)
+    short = f"off: {times:.1f} × labels" if times < _COUNTED else f"off by {detector:.0f} px"
+    return Verdict("poor", short, text)
 
 
 def sentence(text: str) -> str:
@@ -74,14 +80,23 @@ def _without_labels(row: RecordingReport) -> str:
     return text
 
 
-def share_words(shares: ErrorShares) -> str:
-    """Say in plain words where the mean error comes from."""
+def share_words(shares: ErrorShares, nearest_px: float | None = None) -> str:
+    """Say in plain words where the mean error comes from.
+
+    Args:
+        nearest_px: error of the nearest of several ends, where there are several.
+    """
     total, detection = shares.total_px, shares.detection_px
     if detection > 0:
         text = (
             f"Of {total:.1f} px, {detection:.1f} px come from detection: they go when labels take "
             "the place of detections."
         )
+        if nearest_px is not None and nearest_px < total - 0.05:
+            text += (
+                f" {total - nearest_px:.1f} px of these are the choice between the tool's ends: "
+                f"the nearest gives {nearest_px:.1f} px."
+            )
     else:
         text = (
             f"Detection adds nothing: {total:.1f} px, where estimating from the labels themselves "
@@ -126,7 +141,7 @@ def position_words(score: EstimateScore) -> str:
     for axis, value, deviation in zip("xyz", score.position_m, deviations, strict=True):
         spread = "" if deviation is None else f" ± {deviation:.1f}"
         parts.append(f"{axis} {1000 * value:.1f}{spread}")
-    return ", ".join(parts) + " mm"
+    return ", ".join(parts) + "\u00a0mm"
 
 
 def region_words(score: EstimateScore) -> str:
@@ -147,21 +162,33 @@ def region_words(score: EstimateScore) -> str:
     return f"{text}; the true tip lies outside, so the stated uncertainty is too small"
 
 
-def candidate_words(score: EstimateScore) -> Iterator[str]:
-    """Yield a sentence for every other candidate that is a second right answer, else one on all."""
-    others = score.candidates[1:]
-    if score.ambiguous:
-        for other in others:
-            place = ", ".join(f"{1000 * value:.1f}" for value in other.position_m)
-            text = f"({place}) mm, support {other.support:.0%}"
-            if other.error_px is not None:
-                text += f"; it would be off by {other.error_px:.1f} px"
-            if other.tip_error_mm is not None:
-                text += f" and {other.tip_error_mm:.1f} mm"
-            yield text
-    elif others:
-        first = score.candidates[0].support
-        yield f"support {first:.0%}; the next best candidate has {others[0].support:.0%}"
+def end_words(end: CandidateScore) -> str:
+    """Say of one of several ends where it is and how good."""
+    place = ", ".join(f"{1000 * value:.1f}" for value in end.position_m)
+    text = f"({place}) mm, support {end.support:.0%}"
+    if end.error_px is not None:
+        text += f", {end.error_px:.1f} px from the labels"
+    if end.tip_error_mm is not None:
+        text += f", {end.tip_error_mm:.1f} mm from the true tip"
+    return text
+
+
+def prefer_command(row: RecordingReport, end: CandidateScore) -> str:
+    """Return the command line that takes this one of several ends."""
+    rig = str(row.provenance["rig"]["source"])
+    given = "" if rig.endswith(STORED_RIG) else f" --rig {shlex.quote(rig)}"
+    direction = ",".join(f"{value:.3f}" for value in end.position_m)
+    return f"tooltip estimate {shlex.quote(row.recording)}{given} --prefer={direction}"
+
+
+def axis_words(score: EstimateScore) -> str | None:
+    """Return the tool's axis at its end, and how far off it may be; None: not known."""
+    first = score.candidates[0] if score.candidates else None
+    if first is None or first.axis is None:
+        return None
+    along = ", ".join(f"{value:+.3f}" for value in first.axis)
+    spread = "" if first.axis_deg is None else f" ± {first.axis_deg:.1f} degrees"
+    return f"({along}){spread}"
 
 
 def detection_words(row: RecordingReport) -> str:
@@ -210,7 +237,9 @@ def training_words(row: RecordingReport) -> str | None:
         enough = point.frames
     if enough == points[-1].frames:
         return f"more than {points[-2].frames} are needed, maybe more than the {enough} there were"
-    return f"{enough} do as well as all {points[-1].frames} (within 10 %, every time)"
+    tried = max(point.repeats for point in points)
+    drawn = "drawn once" if tried == 1 else "every time"
+    return f"{enough} do as well as all {points[-1].frames} (within 10 %, {drawn})"
 
 
 def headline(report: EvaluationReport) -> str:
@@ -225,16 +254,38 @@ def headline(report: EvaluationReport) -> str:
         tools = "the tool" if overall.compared == 1 else f"{overall.compared} tools"
         text += (
             f" Estimated from motion, the tip of {tools} projects "
-            f"{interval(overall.detector_px)} px from the labels on average; estimated from the "
-            f"labels themselves, {interval(overall.baseline_px)} px."
+            f"{interval(overall.detector_px)} px from the labels on average."
+            f"{_ends_words(report)} Estimated from the labels themselves: "
+            f"{interval(overall.baseline_px)} px."
         )
     if not any(row.labels for row in report.recordings):
         text += " There are no labels, so no error in pixels is known."
     if overall.tip_error_mm is not None:
-        text += f" It lies {overall.tip_error_mm.mean:.1f} mm from the true tip."
+        text += (
+            f" The estimate lies {overall.tip_error_mm.mean:.1f} mm from the true tip on average."
+        )
     if any(row.labels is not None and row.labels.simulated for row in report.recordings):
         text += " The labels are simulated, not placed by a person."
     return text
+
+
+def _ends_words(report: EvaluationReport) -> str:
+    """Say what choosing the nearest of several ends would change."""
+    rows = [row for row in report.recordings if row.detector_px and row.baseline_px]
+    means = [row.detector_px.mean for row in rows if row.detector_px]
+    nearest = [
+        mean if row.detector is None or row.detector.nearest_px is None else row.detector.nearest_px
+        for row, mean in zip(rows, means, strict=True)
+    ]
+    wrong = [
+        row.name for row, mean, best in zip(rows, means, nearest, strict=True) if best < mean - 0.05
+    ]
+    if not wrong:
+        return ""
+    names = ", ".join(wrong[:4]) + (" ..." if len(wrong) > 4 else "")
+    return (
+        f" With the nearest of the several ends of {names}, it would be {np.mean(nearest):.2f} px."
+    )
 
 
 def interval(error: ErrorSummary) -> str:
@@ -279,8 +330,8 @@ def caveats(report: EvaluationReport) -> Iterator[str]:
         )
     yield (
         "Brackets hold 95 % intervals of the mean from 2000 bootstrap draws of blocks of "
-        "neighbouring frames. Intervals of means over tools are for these tools; other tools would "
-        "differ more."
+        "neighbouring frames, widened as Student's t asks for that many blocks. Intervals of means "
+        "over tools are for these tools; other tools would differ more."
     )
     yield (
         f"'As good as labels' means at most {AS_GOOD:g} times the baseline's error, 'near' at most "

@@ -28,6 +28,7 @@ _AXES = (  # of the camera: x to the right, y down, z forward
     "roll about the line of sight",
 )
 _LEAST_IN_SECTOR = 5
+_NOTABLE = 1.2  # times the mean over all frames
 
 
 def worst_figures(row: RecordingReport, table: FrameTable) -> Iterator[Drawing]:
@@ -85,6 +86,7 @@ def _over_time(row: RecordingReport, table: FrameTable) -> Drawing:
             transform=axes.get_xaxis_transform(),
         )
     axes.set_yscale("log")
+    axes.minorticks_off()
     axes.set_xlabel("time since the first test frame [s]")
     axes.set_ylabel("error [px]" if labelled else "distance [px]")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -135,6 +137,8 @@ def _worst_stretch(seconds: Array, errors: Array, parts: int = 5) -> str:
     if len(means) < 2:
         return ""
     mean, start, stop = max(means)
+    if mean < _NOTABLE * float(np.nanmean(errors)):
+        return "No part of the recording stands out."
     return (
         f"Worst from {start:.0f} to {stop:.0f} s, with a mean of {mean:.1f} px; best fifth: "
         f"{min(means)[0]:.1f} px."
@@ -147,7 +151,7 @@ def _over_turn(row: RecordingReport, table: FrameTable, errors: Array, kind: str
     known = np.isfinite(turns).all(axis=1) & np.isfinite(errors)
     spread = np.where(known.any(), turns[known].std(axis=0), 0.0)
     first, second = sorted(np.argsort(-spread, kind="stable")[:2])
-    chart = Chart(2.9, left=0.62, right=0.05)
+    chart = Chart(2.9, left=0.62, right=0.42)
     axes = chart.axes()
     dots = axes.scatter(
         turns[known, first],
@@ -158,7 +162,7 @@ def _over_turn(row: RecordingReport, table: FrameTable, errors: Array, kind: str
         linewidths=0.3,
         edgecolors=MUTED,
     )
-    bar = chart.canvas.colorbar(dots, ax=axes, shrink=0.9)
+    bar = chart.canvas.colorbar(dots, ax=axes, fraction=0.05, pad=0.04)
     bar.set_label("error [px]" if "error" in kind else "distance [px]")
     bar.outline.set_visible(False)
     axes.set_xlabel(f"{_AXES[first]} [deg]")
@@ -187,14 +191,16 @@ def _worst_sector(turns: Array, errors: Array, axes: tuple[int, int]) -> str:
     for column, axis in enumerate(axes):
         low, high = np.percentile(turns[:, column], [100 / 3, 200 / 3])
         for name, inside in (
-            (f"more than {high:.0f} degrees", turns[:, column] > high),
-            (f"less than {low:.0f} degrees", turns[:, column] < low),
+            (f"more than {round(high)} degrees", turns[:, column] > high),
+            (f"less than {round(low)} degrees", turns[:, column] < low),
         ):
             if inside.sum() >= _LEAST_IN_SECTOR:
                 found.append((float(errors[inside].mean()), f"{_AXES[axis]} is {name}"))
     if not found:
         return ""
     mean, where = max(found)
+    if mean < _NOTABLE * float(errors.mean()):
+        return "No part of the wrist's range stands out."
     return (
         f"Worst where its {where}: {mean:.1f} px, against {float(errors.mean()):.1f} px over all."
     )

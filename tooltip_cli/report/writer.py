@@ -9,10 +9,12 @@ from typing import Any
 
 from tooltip_cli.log.messages import IMAGE
 from tooltip_cli.log.recording import Recording
+from tooltip_cli.report.bars import error_by_tool, shares_by_tool, tip_error_by_tool
 from tooltip_cli.report.charts import Drawing
-from tooltip_cli.report.figures import detection_histogram, error_by_tool, error_by_training
+from tooltip_cli.report.figures import detection_histogram, error_by_training
 from tooltip_cli.report.model import EvaluationReport, FrameTable, RecordingReport
 from tooltip_cli.report.page import page
+from tooltip_cli.report.region import region_figure
 from tooltip_cli.report.scenes import Scene, by_severity, scene_figures, thumbnails
 from tooltip_cli.report.section import recording_section
 from tooltip_cli.report.tables import (
@@ -26,8 +28,8 @@ from tooltip_cli.report.tables import (
 from tooltip_cli.report.turnable import rays_figure
 from tooltip_cli.report.worst import worst_figures
 
-VERSION = 2  # of what a section looks like; a change draws all sections anew
-MOST_SECTIONS = 20  # recordings shown in full: hundreds would make a page that opens for nobody
+VERSION = 4  # of what a section looks like; a change draws all sections anew
+MOST_SECTIONS = 16  # recordings shown in full: hundreds would make a page that opens for nobody
 MOST_PICTURES = 400  # in the audit tables of the whole page, which keeps it below 10 MB
 _A_RECORDING = (12, 100)  # least and most pictures of one recording
 Save = Callable[[str, str | bytes], None]
@@ -82,6 +84,8 @@ class ReportWriter:
         self._save("tools.tex", latex_table(report))
         drawn = (
             error_by_tool(report),
+            tip_error_by_tool(report),
+            shares_by_tool(report),
             detection_histogram(report),
             error_by_training(report.recordings),
         )
@@ -129,6 +133,9 @@ def _figures(
     rays = rays_figure(row, scene)
     if rays is not None:
         yield rays
+    region = region_figure(row)
+    if region is not None:
+        yield region
     yield from worst_figures(row, table)
 
 

@@ -345,6 +345,8 @@ def tip_document(result: TipEstimate, origin: dict[str, Any]) -> dict[str, Any]:
             candidate["axis"] = plain(item.axis)
         if item.axis_std is not None:
             candidate["axis_std_deg"] = float(np.degrees(item.axis_std))
+        if item.agreement is not None:
+            candidate["agreement"] = item.agreement
         candidates.append(candidate)
     refined = result.refinement
     return {
@@ -378,6 +380,7 @@ def estimate_from_document(document: dict[str, Any], path: Path) -> TipEstimate:
                     _array(item.get("covariance_m2")),
                     _array(item.get("axis")),
                     _radians(item.get("axis_std_deg")),
+                    item.get("agreement"),
                 )
                 for item in document["candidates"]
             ),

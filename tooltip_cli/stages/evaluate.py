@@ -21,6 +21,7 @@ from tooltip_cli.method.detector import DetectorParams
 from tooltip_cli.method.estimators import EstimatorParams
 from tooltip_cli.method.evaluation import Split, split_by_labels, split_frames
 from tooltip_cli.method.types import Reason
+from tooltip_cli.method.voting.estimate import METHOD as VOTING
 from tooltip_cli.report.model import (
     SCHEMA,
     EvaluationReport,
@@ -49,8 +50,9 @@ from tooltip_cli.stages.estimate import (
 )
 from tooltip_cli.stages.held_out import LABELS_SUFFIX
 from tooltip_cli.stages.measure import Case, Labelled, Protocol, measure
+from tooltip_cli.stages.shape import Voters, voted_shape
 
-VERSION = 2
+VERSION = 4
 DEFAULT_DIRECTORY = "report"
 _LOGGER = logging.getLogger(__name__)
 
@@ -111,7 +113,7 @@ def evaluate(
         rig: rig file, or a folder with ``STEM.rig.yaml``; default: the one in the recording.
         split: ``random`` or ``blocks``; where labels exist they decide.
         curve: estimate from ever fewer training frames too, which takes several estimates;
-            default: where that is quick.
+            default: from as few as are quick.
         frame: image index that the figures of each recording show, or the test frame nearest to
             it; default: one whose error is typical.
         out: directory of the report; default: ``report`` beside the first recording. Stages that
@@ -207,12 +209,15 @@ def evaluate_recording(
     )
     on_step(path, f"{_how(detected.reused)} {detected.path}")
     tips = places.report / "tips"
+    allowed = np.isin(np.arange(len(recording.image_stamps_ns)), split.train)
+    voting, edges_out = protocol.params.voting, places.out or tips / "detections"
+    voters = Voters(recording, views, allowed, voting, edges_out)
     found = {
         "detections": estimate_from_images(
             recording,
             views,
             protocol.params,
-            np.isin(np.arange(len(recording.image_stamps_ns)), split.train),
+            allowed,
             detector=protocol.detector,
             out=tips / "detections",
             detected_out=places.out,
@@ -235,14 +240,15 @@ def evaluate_recording(
         protocol.params,
         split,
         None if labelled is None else labelled.labels,
+        lambda: voted_shape(voters, found["detections"], tips / "shape"),
     )
     key = _key(recording, detected, found, split, labelled, truth, protocol)
     place = places.report / "parts" / f"{path.stem}.json"
     stored = None if force else _stored(place, key)
     if stored is not None:
         on_step(path, f"reused {place}")
-        return Evaluated(*stored, True, scene)
-    detected_out = places.out or tips / "detections"
+        row, table = stored  # perhaps of the time when it lay elsewhere
+        return Evaluated(replace(row, recording=str(path)), table, True, scene)
     case = Case(
         recording,
         rig,
@@ -254,7 +260,7 @@ def evaluate_recording(
         truth,
         protocol,
         key,
-        detected_out,
+        voters if protocol.params.method == VOTING else None,
     )
     row, table = measure(case, places.report)
     document = {"key": key, "row": plain(row), "frames": plain(table)}
@@ -326,7 +332,7 @@ def _key(
     parents["label_set"] = digest(None if labelled is None else labelled.described)
     parents["states"] = digest(None if labelled is None else labelled.states)
     parents["truth"] = digest(truth)
-    parents["name"] = str(recording.path)
+    parents["name"] = recording.path.stem
     return stage_key("evaluate", VERSION, parents, protocol)
 
 

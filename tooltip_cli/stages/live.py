@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import shutil
-import threading
 import time
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from tooltip_cli.errors import LowDiskError, TooltipError
@@ -16,17 +13,13 @@ from tooltip_cli.log.crashsafe import MIN_FREE_BYTES, CrashSafeWriter, leftovers
 from tooltip_cli.log.messages import Message
 from tooltip_cli.log.stopping import Stop
 from tooltip_cli.method.voting.watching import Verdict
-from tooltip_cli.sources.live import QUEUE_BYTES, Backlog, LiveSource, Receiver
+from tooltip_cli.sources.live import QUEUE_BYTES, LiveSource
+from tooltip_cli.stages.listening import Listening, StreamStatus
 from tooltip_cli.stages.record import Recorded, attach_rig
 from tooltip_cli.stages.watching import MotionObserver
 
 METADATA = "tooltip_recording"
-_LOG = logging.getLogger(__name__)
 _STATUS_EVERY_S = 0.25
-_RATE_OVER_S = 2.0
-_SILENT_S = 1.0  # reported
-_RETRY_S = 1.0
-_JOIN_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -42,18 +35,6 @@ class LiveOptions:
 
 
 @dataclass(frozen=True)
-class StreamStatus:
-    """One topic while it is recorded."""
-
-    topic: str
-    received: int
-    dropped: int
-    rate_hz: float  # over the last two seconds
-    silent: bool  # nothing for a second
-    expected: bool  # images, joints or poses
-
-
-@dataclass(frozen=True)
 class Status:
     """A recording while it is made."""
 
@@ -63,14 +44,6 @@ class Status:
     size_bytes: int
     free_bytes: int  # on the disk
     verdict: Verdict | None  # None: without a rig the motion is not judged
-
-
-@dataclass
-class _Heard:
-    received: int = 0
-    since: float = field(default_factory=time.monotonic)  # last message, or the start
-    silent: bool = False
-    history: deque[tuple[float, int]] = field(default_factory=deque)
 
 
 def record_live(
@@ -100,7 +73,9 @@ def record_live(
     """
     recorder = _Recorder(source, options, stop, observer, on_status, on_note)
     for place in leftovers(out):
-        recorder.note(f"{place} is what an earlier recording left; 'tooltip salvage' recovers it")
+        recorder.heard.note(
+            f"{place} is what an earlier recording left; 'tooltip salvage' recovers it"
+        )
     low: LowDiskError | None = None
     with CrashSafeWriter(out, overwrite=overwrite, min_free_bytes=options.min_free_bytes) as writer:
         if source.rig is not None:
@@ -112,7 +87,7 @@ def record_live(
             low = error
         if not source.report.read.get(source.image_topic):
             writer.discard()
-            reasons = "; ".join(recorder.ends) or "it was stopped before"
+            reasons = "; ".join(recorder.heard.ends) or "it was stopped before"
             raise TooltipError(f"{out} was not written, for no image came: {reasons}")
         recorder.close()
     if low is not None:
@@ -132,27 +107,14 @@ class _Recorder:
     ) -> None:
         self._source, self._options, self._stop = source, options, stop
         self._observer, self._on_status, self._on_note = observer, on_status, on_note
-        self._backlog = Backlog(options.queue_bytes)
-        self._halt = threading.Event()
-        self._threads: list[threading.Thread] = []
-        self._heard = {topic: _Heard() for topic in source.expected_topics}
+        self.heard = Listening(source, reconnect=options.reconnect, queue_bytes=options.queue_bytes)
         self._first_image: float | None = None
-        self._lock = threading.Lock()
-        self._told = 0  # notes of the report, which the receivers' threads add to as well
-        self.ends: list[str] = []
-
-    def note(self, text: str) -> None:
-        """Keep a sentence for a person, who is told soon."""
-        self._source.report.notes.append(text)
 
     def run(self, writer: CrashSafeWriter, out: Path) -> None:
         """Receive and write until an end is reached."""
         for message in self._source.first_messages():
             self._write(writer, message)
-        for receiver in self._source.receivers():
-            thread = threading.Thread(target=self._listen, args=(receiver,), daemon=True)
-            self._threads.append(thread)
-            thread.start()
+        self.heard.start()
         shown = 0.0
         try:
             while not self._ended():
@@ -162,56 +124,25 @@ class _Recorder:
                     self._tell_news()
                     self._on_status(self._status(writer, out))
         finally:
-            self._halt.set()
-        for thread in self._threads:
-            thread.join(_JOIN_S)
+            self.heard.halt()
         while self._drain(writer, 0.0):
             pass
 
     def close(self) -> None:
         """Say what was lost and why it ended."""
-        for topic, count in sorted(self._backlog.counts()[1].items()):
-            reason = f"messages on {topic} that came faster than they could be written"
-            self._source.report.dropped[reason] = count
-        for reason in self.ends:
-            self.note(f"ended: {reason}")
+        self.heard.count_drops("written")
+        for reason in self.heard.ends:
+            self.heard.note(f"ended: {reason}")
         if self._observer is not None and self._observer.problem:
-            self.note(f"the motion was not judged: {self._observer.problem}")
+            self.heard.note(f"the motion was not judged: {self._observer.problem}")
         self._tell_news()
-
-    def _listen(self, receiver: Receiver) -> None:
-        """Run a receiver in its thread, again and again where that is asked for."""
-        told = ""
-        while not self._halt.is_set():
-            try:
-                receiver.run(self._deliver, self._halt)
-                reason = f"{receiver.name} has ended"
-            except TooltipError as error:
-                reason = str(error)
-            except Exception as error:  # of a driver or of a user's own joint source
-                _LOG.debug("receiver failed", exc_info=True)
-                reason = f"{receiver.name} failed ({type(error).__name__}: {error})"
-            if self._halt.is_set():
-                return
-            with self._lock:
-                if not self._options.reconnect:
-                    self.ends.append(reason)
-                    return
-                if reason != told:
-                    self.note(f"{reason}; waiting for it")
-                    told = reason
-            self._halt.wait(_RETRY_S)
-
-    def _deliver(self, message: Message) -> None:
-        if not self._halt.is_set():
-            self._backlog.put(message)
 
     def _drain(self, writer: CrashSafeWriter, timeout_s: float) -> bool:
         """Write what waits; return whether there was anything."""
-        messages = self._backlog.take(timeout_s)
+        messages = self.heard.backlog.take(timeout_s)
         for message in messages:
             self._write(writer, message)
-            self._backlog.written(message)
+            self.heard.backlog.written(message)
         return bool(messages)
 
     def _write(self, writer: CrashSafeWriter, message: Message) -> None:
@@ -224,61 +155,28 @@ class _Recorder:
 
     def _ended(self) -> bool:
         """Whether an end is reached; its reason is then in ``ends``, or was the user's own."""
-        options, now = self._options, time.monotonic()
-        with self._lock:
-            if self.ends:
-                return True
+        options = self._options
+        if self.heard.ended:
+            return True
         if self._stop.requested:
             return True
         if self._first_image is not None and options.duration_s is not None:
-            return now - self._first_image >= options.duration_s
+            return time.monotonic() - self._first_image >= options.duration_s
         if options.until_enough and self._observer is not None and self._observer.ample:
-            self.ends.append("the motion is enough")
+            self.heard.ends.append("the motion is enough")
             return True
-        heard = self._heard[self._source.image_topic]
-        if not options.reconnect and now - heard.since > options.patience_s:
-            self.ends.append(
-                f"no image on {self._source.image_topic} for {options.patience_s:.0f} s"
-            )
-            return True
-        return False
+        return self.heard.patience_is_over(options.patience_s)
 
     def _tell_news(self) -> None:
-        notes = self._source.report.notes
-        while self._told < len(notes):
-            self._on_note(notes[self._told])
-            self._told += 1
+        for note in self.heard.news():
+            self._on_note(note)
 
     def _status(self, writer: CrashSafeWriter, out: Path) -> Status:
-        now = time.monotonic()
-        received, dropped = self._backlog.counts()
-        streams = [
-            self._stream(topic, now, received.get(topic, 0), dropped.get(topic, 0))
-            for topic in {**self._heard, **dict.fromkeys(received)}
-        ]
         return Status(
-            elapsed_s=0.0 if self._first_image is None else now - self._first_image,
-            streams=tuple(streams),
-            queued_bytes=self._backlog.waiting_bytes,
+            elapsed_s=(0.0 if self._first_image is None else time.monotonic() - self._first_image),
+            streams=tuple(self.heard.streams()),
+            queued_bytes=self.heard.backlog.waiting_bytes,
             size_bytes=writer.written_bytes,
             free_bytes=shutil.disk_usage(out.parent).free,
             verdict=self._observer.verdict() if self._observer is not None else None,
         )
-
-    def _stream(self, topic: str, now: float, received: int, dropped: int) -> StreamStatus:
-        heard = self._heard.setdefault(topic, _Heard())
-        expected = topic in self._source.expected_topics
-        if received > heard.received:
-            if heard.silent:
-                again = "again " if heard.received else ""
-                self.note(f"{topic} is heard {again}after {now - heard.since:.1f} s")
-            heard.received, heard.since, heard.silent = received, now, False
-        elif expected and not heard.silent and now - heard.since > _SILENT_S:
-            heard.silent = True
-            self.note(f"nothing on {topic} " + ("yet" if not received else "any more"))
-        heard.history.append((now, received))
-        while now - heard.history[0][0] > _RATE_OVER_S:
-            heard.history.popleft()
-        before, count = heard.history[0]
-        rate = (received - count) / (now - before) if now > before else 0.0
-        return StreamStatus(topic, received, dropped, rate, heard.silent, expected)

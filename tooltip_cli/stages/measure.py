@@ -1,8 +1,8 @@
-"""What one recording's row of the report is made of: errors, their shares, the training curve."""
+"""What one recording's row of the report is made of: errors and their shares."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,9 @@ from tooltip_cli.labels.files import MatchedLabels
 from tooltip_cli.log.recording import Recording
 from tooltip_cli.log.views import Views, resolve_views
 from tooltip_cli.method.detector import DetectorParams
-from tooltip_cli.method.estimators import ESTIMATORS, EstimatorParams, estimate_tip
+from tooltip_cli.method.estimators import EstimatorParams, estimate_tip
 from tooltip_cli.method.evaluation import Split, fit_clock, pixel_errors
-from tooltip_cli.method.rays import sphere_array
-from tooltip_cli.method.types import Array, Indices, TipEstimate
-from tooltip_cli.method.voting.estimate import METHOD as VOTING
-from tooltip_cli.method.voting.estimate import estimate_by_voting
+from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.report.model import (
     ErrorShares,
     EstimateScore,
@@ -27,7 +24,6 @@ from tooltip_cli.report.model import (
     LabelSet,
     RecordingReport,
     SplitUsed,
-    TrainingPoint,
 )
 from tooltip_cli.report.scoring import (
     Truth,
@@ -39,14 +35,10 @@ from tooltip_cli.report.scoring import (
 )
 from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.stages.artifacts import digest, plain, provenance
+from tooltip_cli.stages.curve import training_curve
 from tooltip_cli.stages.detect import Detected
 from tooltip_cli.stages.estimate import Estimated, estimation_input
-from tooltip_cli.stages.moving import detect_edges_in
-from tooltip_cli.stages.voting import hand_edges, pair_views
-
-TRAINING_CURVE = {10: 5, 25: 5, 50: 5, 100: 2, 200: 1, 400: 1}
-"""Sizes of the training curve and how many subsets of each: large ones are costly and alike, and
-more than half of the frames would be nearly the same frames again."""
+from tooltip_cli.stages.shape import Voters
 
 
 @dataclass(frozen=True)
@@ -59,7 +51,7 @@ class Protocol:
     split: str = "random"  # or blocks: contiguous test blocks
     params: EstimatorParams = field(default_factory=EstimatorParams)
     detector: DetectorParams = field(default_factory=DetectorParams)
-    curve: bool | None = None  # estimate from fewer training frames too; None: where it is quick
+    curve: bool | None = None  # estimate from fewer training frames too; None: as far as is quick
 
 
 @dataclass(frozen=True)
@@ -86,7 +78,7 @@ class Case:
     truth: Truth | None
     protocol: Protocol
     key: str
-    detected_out: Path | None = None  # directory of what was detected; None: beside the recording
+    voters: Voters | None = None  # of an estimate by voting
 
 
 def measure(case: Case, report_dir: Path) -> tuple[RecordingReport, FrameTable]:
@@ -126,7 +118,7 @@ def measure(case: Case, report_dir: Path) -> tuple[RecordingReport, FrameTable]:
         detector=detector,
         baseline=baseline,
         shares=_shares(case, table),
-        training=tuple(_training_curve(case, table)),
+        training=tuple(training_curve(case, table, report_dir)),
         provenance=_provenance(case),
     )
     return row, table
@@ -210,6 +202,20 @@ def _clock_projection(case: Case, frames: Indices) -> Callable[[Array, float], A
     return project
 
 
+def _clock_px(case: Case, table: FrameTable, offset_s: float, residual_px: float) -> float:
+    """Return what of the baseline's error goes when it is estimated anew with shifted stamps."""
+    if case.labelled is None:
+        return 0.0
+    rig = replace(case.rig, time_offset_s=case.rig.time_offset_s + offset_s)
+    views = resolve_views(case.recording, rig)
+    seen = estimation_input(views, case.labelled.labels.visible)
+    tip = estimate_tip(seen, case.protocol.params).position
+    if tip is None:
+        return 0.0
+    errors = pixel_errors(project_tip(views, tip, table.frames), table.label)
+    return float(np.clip(residual_px - np.nanmean(errors), 0.0, residual_px))
+
+
 def _shares(case: Case, table: FrameTable) -> ErrorShares | None:
     """Attribute the mean error to detection, to the clocks, and to calibration and labels."""
     labels = case.found.get("labels")
@@ -221,7 +227,7 @@ def _shares(case: Case, table: FrameTable) -> ErrorShares | None:
     fit = fit_clock(project, table.label[scored], labels.estimate.position)
     total, residual = float(np.nanmean(prediction)), float(np.nanmean(baseline))
     shown = fit is not None and fit.shown
-    clock = min(fit.error_without_px - fit.error_px, residual) if fit and shown else 0.0
+    clock = _clock_px(case, table, fit.offset_s, residual) if fit and shown else 0.0
     noise = pixel_errors(table.truth, table.label)
     return ErrorShares(
         total_px=total,
@@ -232,76 +238,4 @@ def _shares(case: Case, table: FrameTable) -> ErrorShares | None:
         clock_deviation_ms=None if fit is None else 1000 * fit.deviation_s,
         clock_shown=shown,
         label_noise_px=float(np.nanmean(noise)) if np.isfinite(noise).any() else None,
-    )
-
-
-def _training_curve(case: Case, table: FrameTable) -> list[TrainingPoint]:
-    """Estimate from ever more of the training frames, drawn at random (4.4: are 400 too many?)."""
-    params, curve = case.protocol.params, case.protocol.curve
-    if curve is None:
-        curve = params.method in ESTIMATORS
-    final = case.found["detections"].estimate
-    if not curve:
-        return []
-    train, estimate_on = _votes(case) if params.method == VOTING else _detections(case)
-    rng = np.random.default_rng(case.protocol.seed)
-    points = []
-    for size in (size for size in TRAINING_CURVE if 2 * size <= len(train)):
-        repeats = TRAINING_CURVE[size] if params.method in ESTIMATORS else 1
-        estimates = [estimate_on(rng.permutation(train)[:size]) for _ in range(repeats)]
-        points.append(_training_point(size, estimates, final, case.views, table))
-    return [*points, _training_point(len(train), [final], final, case.views, table)]
-
-
-EstimateOn = Callable[[Indices], TipEstimate]
-
-
-def _detections(case: Case) -> tuple[Indices, EstimateOn]:
-    """Return the training frames with a detection, and the estimate from some of them."""
-    pixels = case.detected.detections.tip_pixels()
-
-    def estimate_on(frames: Indices) -> TipEstimate:
-        chosen = pixels.select(np.isin(pixels.frames, frames))
-        return estimate_tip(estimation_input(case.views, chosen), case.protocol.params)
-
-    return case.split.train[np.isin(case.split.train, pixels.frames)], estimate_on
-
-
-def _votes(case: Case) -> tuple[Indices, EstimateOn]:
-    """Return the frames that vote, and the estimate from some of them."""
-    settings, views = case.protocol.params.voting, case.views
-    allowed = np.isin(np.arange(len(views.stamps_ns)), case.split.train)
-    pairing, camera_from_hand = pair_views(views, settings, allowed)
-    if case.found["detections"].estimate.position is None:
-        return pairing.frames[:0], lambda frames: case.found["detections"].estimate
-    edges = detect_edges_in(case.recording, views, pairing, settings, out=case.detected_out).edges
-    spheres = sphere_array([(item.center, item.radius) for item in views.spheres])
-
-    def estimate_on(frames: Indices) -> TipEstimate:
-        chosen = hand_edges(views, edges.of_frames(frames), camera_from_hand, settings)
-        return estimate_by_voting(chosen, spheres, settings)
-
-    return edges.frames, estimate_on
-
-
-def _training_point(
-    size: int,
-    estimates: Sequence[TipEstimate],
-    final: TipEstimate,
-    views: Views,
-    table: FrameTable,
-) -> TrainingPoint:
-    tips = [item.position for item in estimates if item.position is not None]
-    errors = [pixel_errors(project_tip(views, tip, table.frames), table.label) for tip in tips]
-    means = [float(np.nanmean(error)) for error in errors if np.isfinite(error).any()]
-    goal = final.position
-    shifts = [] if goal is None else [float(np.linalg.norm(tip - goal)) for tip in tips]
-    return TrainingPoint(
-        frames=size,
-        repeats=len(estimates),
-        refused=len(estimates) - len(tips),
-        error_px=float(np.mean(means)) if means else None,
-        low_px=min(means) if means else None,
-        high_px=max(means) if means else None,
-        shift_mm=float(1000 * np.mean(shifts)) if shifts else None,
     )

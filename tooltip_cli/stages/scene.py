@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from tooltip_cli.log.recording import Recording
 from tooltip_cli.log.views import Views
 from tooltip_cli.method.types import Indices
 from tooltip_cli.method.voting.params import SilhouetteParams
@@ -31,6 +31,13 @@ _GRID = (33, 25)  # columns and rows at which a camera's turn is computed, the r
 _OUTSIDE = -1e4  # a pixel that no image has
 
 
+class ColourImages(Protocol):
+    """Images by their indices, such as a recording's."""
+
+    def images(self, indices: Iterable[int]) -> Iterator[Image]:
+        """Yield decoded images, (H, W, 3) BGR or (H, W) gray, uint8, of one size."""
+
+
 class Scene:
     """The scene without hand and tool, learnt from images all over the recording.
 
@@ -39,20 +46,20 @@ class Scene:
     """
 
     def __init__(
-        self, recording: Recording, views: Views, frames: Indices, params: SilhouetteParams
+        self, pictures: ColourImages, views: Views, frames: Indices, params: SilhouetteParams
     ) -> None:
         """Learn the scene from some of the frames, image indices.
 
         Raises:
             TooltipError: an image cannot be decoded.
         """
-        self._recording, self._views, self._params = recording, views, params
+        self._pictures, self._views, self._params = pictures, views, params
         self._reference = views.root_from_camera[frames[len(frames) // 2]]
         count = int(_MEMORY / (3 * views.camera.width * views.camera.height))
         count = min(params.samples, max(count, _FEWEST_SAMPLES), len(frames))
         chosen = frames[np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
         samples = []
-        for index, image in zip(chosen, recording.images(chosen), strict=True):
+        for index, image in zip(chosen, pictures.images(chosen), strict=True):
             # pixels of the reference, looked up in this image
             turn = self._turn(views.root_from_camera[index], self._reference)
             samples.append(image if turn is None else _looked_up(image, turn))
@@ -65,11 +72,20 @@ class Scene:
             TooltipError: an image cannot be decoded.
         """
         lap = laps()
-        for index, image in zip(frames, self._recording.images(frames), strict=True):
+        for index, image in zip(frames, self._pictures.images(frames), strict=True):
             lap("decode")
-            backdrop = self._seen_from(self._views.root_from_camera[index])
-            yield silhouette(_channels(image), backdrop, self._params)
+            yield self.silhouette(image, self._views.root_from_camera[index])
             lap("silhouettes")
+
+    def silhouette(
+        self, image: Image, root_from_camera: npt.NDArray[np.float64]
+    ) -> FrameSilhouette:
+        """Return what stands before the scene in an image (H, W, 3) or (H, W).
+
+        Args:
+            root_from_camera: (3, 3) how the camera was turned.
+        """
+        return silhouette(_channels(image), self._seen_from(root_from_camera), self._params)
 
     def _seen_from(self, root_from_camera: npt.NDArray[np.float64]) -> Backdrop:
         turn = self._turn(self._reference, root_from_camera)

@@ -23,7 +23,7 @@ def in_order(
     At most ``jobs + 1`` chunks are under way, so memory does not grow with their number.
     """
     remaining = iter(starts)
-    with _threads_are_ours(), ThreadPoolExecutor(jobs) as pool:
+    with threads_are_ours(), ThreadPoolExecutor(jobs) as pool:
 
         def submit(count: int) -> list[Future[list[_Result]]]:
             return [pool.submit(work, start) for start in islice(remaining, count)]
@@ -39,7 +39,7 @@ def in_order(
 
 
 @contextmanager
-def _threads_are_ours() -> Iterator[None]:
+def threads_are_ours() -> Iterator[None]:
     """Let every piece of work have one core, and keep its memory.
 
     OpenCV would divide each image among all cores, on top of the chunks that run side by side. And

@@ -29,7 +29,7 @@ def pair_views(
 ) -> tuple[Pairing, Array]:
     """Return the pairing of a recording's images and (N, 4, 4) camera_from_hand."""
     camera_from_hand = inverse_transform(views.hand_from_camera)
-    return pair_frames(camera_from_hand, _focal(views.camera), settings.pairing, allowed), (
+    return pair_frames(camera_from_hand, focal_px(views.camera), settings.pairing, allowed), (
         camera_from_hand
     )
 
@@ -116,7 +116,7 @@ def hand_edges(
         _normalized(camera, pixels[:, None] + moving.translations),
         _normalized(camera, carried),
         camera_from_hand,
-        _focal(camera),
+        focal_px(camera),
         image_extent(camera),
         settings.moving.reach,
         _hand_silhouettes(camera, moving, camera_from_hand),
@@ -137,7 +137,7 @@ def _hand_silhouettes(
         view,
         _normalized(camera, found.contours.astype(float)),
         found.row_of_point,
-        _focal(camera),
+        focal_px(camera),
     )
 
 
@@ -166,5 +166,6 @@ def _normalized(camera: CameraModel, pixels: Array) -> Array:
     return np.asarray(rays[..., :2] / rays[..., 2:])
 
 
-def _focal(camera: CameraModel) -> float:
+def focal_px(camera: CameraModel) -> float:
+    """Return ideal pixels per unit of normalized coordinates."""
     return float(np.sqrt(camera.fx * camera.fy))

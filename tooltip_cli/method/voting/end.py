@@ -87,13 +87,17 @@ def grip_of(spheres: Array) -> Array:
     return np.asarray(np.average(spheres[:, :3], axis=0, weights=spheres[:, 3] ** 3))
 
 
-def far_voxels(shape: Shape, params: EndParams) -> Indices:
-    """Return voxels that are farthest from the wrist in their surroundings, farthest first."""
+def far_voxels(shape: Shape, params: EndParams, grip: Array | None = None) -> Indices:
+    """Return voxels that are farthest from the grip in their surroundings, farthest first.
+
+    Args:
+        grip: (3,) metres, hand frame; default: the hand's origin.
+    """
     if not len(shape.voxels):
         return np.zeros(0, dtype=np.intp)
     from scipy.spatial import KDTree
 
-    distances = np.linalg.norm(shape.voxels, axis=1)
+    distances = np.linalg.norm(shape.voxels - (0.0 if grip is None else grip), axis=1)
     order = np.argsort(-distances, kind="stable")
     order = order[distances[order] >= params.other_end_share * distances.max()]
     # most have a farther one right beside them, which is soon seen

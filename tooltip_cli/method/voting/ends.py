@@ -46,7 +46,7 @@ class FoundEnd:
 class _Rough:
     """Where an end may be."""
 
-    far: Array  # (3,) metres, hand frame: the voxel of it that is farthest from the wrist
+    far: Array  # (3,) metres, hand frame: the voxel of it that is farthest from the grip
     voted: ToolEnd | None
     solid: tuple[ToolEnd, ...]  # as the hull has it
 
@@ -54,7 +54,10 @@ class _Rough:
 def find_ends(
     edges: HandEdges, cloud: Cloud, shape: Shape, spheres: Array, settings: VotingSettings
 ) -> list[FoundEnd]:
-    """Return the tool's ends, the farthest from the wrist first; at least one.
+    """Return the tool's ends, the farthest from the grip first; at least one.
+
+    From the grip, not from the wrist: a tool that is held tilted towards the wrist has its handle's
+    end farther from that than its tip.
 
     Args:
         shape: where the votes say that hand or tool is; not empty.
@@ -70,10 +73,10 @@ def find_ends(
             end = by_edges if end is None or by_edges.agreement > end.agreement else end
         if end is not None:
             ends.append(end)
-    return _apart(ends, settings.end)
+    return _apart(ends, grip_of(spheres), settings.end)
 
 
-def _apart(ends: list[FoundEnd], params: EndParams) -> list[FoundEnd]:
+def _apart(ends: list[FoundEnd], grip: Array, params: EndParams) -> list[FoundEnd]:
     """Return ends that differ, the farthest first; of those at one place the best.
 
     One that far fewer images show, or agree on, than on another is no end that could be meant.
@@ -89,26 +92,26 @@ def _apart(ends: list[FoundEnd], params: EndParams) -> list[FoundEnd]:
     kept = [
         end for end in kept if end.agreement >= agreement and end.candidate.support >= support
     ] or kept[:1]
-    kept.sort(key=lambda end: -float(np.linalg.norm(end.candidate.position)))
-    least = params.other_end_share * np.linalg.norm(kept[0].candidate.position)
-    return [end for end in kept if np.linalg.norm(end.candidate.position) >= least]
+    kept.sort(key=lambda end: -float(np.linalg.norm(end.candidate.position - grip)))
+    least = params.other_end_share * np.linalg.norm(kept[0].candidate.position - grip)
+    return [end for end in kept if np.linalg.norm(end.candidate.position - grip) >= least]
 
 
 def _rough_ends(
     edges: HandEdges, cloud: Cloud, shape: Shape, spheres: Array, settings: VotingSettings
 ) -> list[_Rough]:
-    params, same = settings.end, settings.outline.same_end
+    params, same, grip = settings.end, settings.outline.same_end, grip_of(spheres)
     votes = [
         (shape.voxels[far], locate_end(cloud, shape, shape.voxels[far], spheres, params))
-        for far in far_voxels(shape, params)
+        for far in far_voxels(shape, params, grip)
     ]
     silhouettes = edges.silhouettes
     rough: list[_Rough] = []
     if silhouettes is not None:
         hull = visual_hull(silhouettes, spheres, edges.reach, settings.hull)
         sure = _confirmed(hull, shape, settings.hull.confirmed)
-        bulges = [hull.voxels[row] for row in far_voxels(hull, params)]
-        for row in far_voxels(sure, params):
+        bulges = [hull.voxels[row] for row in far_voxels(hull, params, grip)]
+        for row in far_voxels(sure, params, grip):
             far = sure.voxels[row]
             near = [end for at, end in votes if np.linalg.norm(at - far) < same]
             solid = [locate_hull_end(sure, far, spheres, params)]
@@ -216,7 +219,9 @@ def _by_edges(
 
 def _refined(end: RefinedEnd, support: float, settings: VotingSettings) -> FoundEnd:
     covariance, axis_variance = _uncertainty(end, settings.trust)
-    candidate = Candidate(end.position, support, covariance, end.axis, axis_variance**0.5)
+    candidate = Candidate(
+        end.position, support, covariance, end.axis, axis_variance**0.5, end.agreement
+    )
     return FoundEnd(candidate, end.agreement)
 
 
@@ -273,5 +278,5 @@ def _end_near(
     if not near.any():
         return None
     voxels = shape.voxels[near]
-    start = voxels[int(np.argmax(np.linalg.norm(voxels, axis=1)))]
+    start = voxels[int(np.argmax(np.linalg.norm(voxels - grip_of(spheres), axis=1)))]
     return locate_end(cloud, shape, start, spheres, params).position

@@ -76,7 +76,10 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     reason = _hidden(first.position, edges, trust)
     if reason is not None:
         return refused(METHOD, used, reason)
+    agreement = next(end.agreement for end in found if end.candidate is first)
     reasons = () if len(candidates) == 1 else (_ambiguous(candidates),)
+    if agreement < trust.doubtful_agreement:
+        reasons = (*reasons, _disagreeing(agreement))
     return TipEstimate(METHOD, first.position, first.covariance, tuple(candidates), reasons, used)
 
 
@@ -125,6 +128,16 @@ def _only_the_hand() -> Reason:
     )
 
 
+def _disagreeing(agreement: float) -> Reason:
+    share = f"only {agreement:.0%} of what the images show of the end fits"
+    return Reason(
+        "images_disagree",
+        (share if agreement else "the images show too little of the end")
+        + "; the clocks or the camera's pose may be off: --refine all, or tooltip calibrate, finds "
+        "out by how much",
+    )
+
+
 def _ambiguous(candidates: list[Candidate]) -> Reason:
     others = ", ".join(
         "(" + ", ".join(f"{1000 * value:.0f}" for value in item.position) + ")"
@@ -132,7 +145,7 @@ def _ambiguous(candidates: list[Candidate]) -> Reason:
     )
     return Reason(
         "ambiguous_end",
-        f"the tool has {len(candidates)} ends at nearly the same distance from the wrist; the "
+        f"the tool has {len(candidates)} ends at nearly the same distance from the grip; the "
         f"farthest is given, the others are at {others} mm; --prefer with one "
         "of these as direction chooses",
     )

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from tooltip_cli.method.types import Array, Indices, Mask
 from tooltip_cli.method.voting.params import PairingParams
 
+_ROWS_AT_ONCE = 512  # images whose partners are looked for together; bounds memory
 _PROBE_QUANTILE = 0.75  # of the probes' displacements: those on the axis of rotation never move
 
 
@@ -39,18 +40,36 @@ def pair_frames(
     count = len(camera_from_hand)
     if allowed is not None:
         camera_from_hand = np.where(allowed[:, None, None], camera_from_hand, np.nan)
-    probes = _project(camera_from_hand, _probe_points(params.probe_radius), focal_px)
-    partners = np.full((count, 2), -1, dtype=np.intp)
-    moved = np.zeros((count, 2))
-    consecutive = np.zeros(0)
-    for side, step in enumerate((-1, 1)):
-        best = np.full(count, np.inf)
-        for gap in range(1, min(params.max_gap, count - 1) + 1):
-            other = np.arange(count) + step * gap
-            inside = (other >= 0) & (other < count)
-            pixels = _displacement(probes, probes[np.clip(other, 0, count - 1)])
-            if gap == 1 and step == 1:
-                consecutive = pixels[inside & np.isfinite(pixels)]
+    probes = probe_pixels(camera_from_hand, focal_px, params)
+    partners, moved = find_partners(probes, np.arange(count), params)
+    consecutive = displacement(probes[:-1], probes[1:])
+    consecutive = consecutive[np.isfinite(consecutive)]
+    paired = np.asarray((partners >= 0).all(axis=1))
+    chosen = farthest_points(orientations(camera_from_hand), paired, params.frames)
+    fastest = float(np.median(consecutive)) if len(consecutive) else 0.0
+    return Pairing(chosen, partners[chosen], moved[chosen], fastest)
+
+
+def find_partners(probes: Array, rows: Indices, params: PairingParams) -> tuple[Indices, Array]:
+    """Find the images to which the probes move nearest to the wanted displacement.
+
+    Args:
+        probes: (N, S, 2) the probes' pixels in consecutive images; NaN where they are unknown.
+        rows: (R,) images that partners are looked for.
+
+    Returns:
+        (R, 2) images before and after, -1: none; and (R, 2) pixels that the probes move by.
+    """
+    count, gaps = len(probes), np.arange(1, params.max_gap + 1)
+    partners = np.full((len(rows), 2), -1, dtype=np.intp)
+    moved = np.zeros((len(rows), 2))
+    for start in range(0, len(rows), _ROWS_AT_ONCE):
+        some = rows[start : start + _ROWS_AT_ONCE]
+        for side, step in enumerate((-1, 1)):
+            others = some[:, None] + step * gaps
+            inside = (others >= 0) & (others < count)
+            first, second = probes[some][:, None], probes[np.clip(others, 0, count - 1)]
+            pixels = displacement(first, second)
             usable = (
                 inside
                 & (pixels >= params.min_displacement_px)
@@ -58,13 +77,21 @@ def pair_frames(
             )
             with np.errstate(divide="ignore", invalid="ignore"):
                 cost = np.abs(np.log(pixels / params.displacement_px))
-            better = usable & (cost < best)
-            partners[better, side], best[better] = other[better], cost[better]
-            moved[better, side] = pixels[better]
-    paired = np.asarray((partners >= 0).all(axis=1))
-    chosen = farthest_points(camera_from_hand[:, :3, :3].reshape(count, 9), paired, params.frames)
-    fastest = float(np.median(consecutive)) if len(consecutive) else 0.0
-    return Pairing(chosen, partners[chosen], moved[chosen], fastest)
+            best = np.argmin(np.where(usable, cost, np.inf), axis=1)
+            found = np.flatnonzero(usable.any(axis=1))
+            partners[start + found, side] = others[found, best[found]]
+            moved[start + found, side] = pixels[found, best[found]]
+    return partners, moved
+
+
+def probe_pixels(camera_from_hand: Array, focal_px: float, params: PairingParams) -> Array:
+    """Return (N, S, 2) where points at a tool's distance from the hand project; NaN: unknown."""
+    return _project(camera_from_hand, _probe_points(params.probe_radius), focal_px)
+
+
+def orientations(camera_from_hand: Array) -> Array:
+    """Return (N, 9) what hand orientations are told apart by."""
+    return camera_from_hand[:, :3, :3].reshape(-1, 9)
 
 
 def farthest_points(features: Array, usable: Mask, count: int) -> Indices:
@@ -107,10 +134,10 @@ def _project(camera_from_hand: Array, points: Array, focal_px: float) -> Array:
         return np.asarray(focal_px * camera[..., :2] / depth)
 
 
-def _displacement(first: Array, second: Array) -> Array:
-    """Return (N,) the upper quartile over the probes of how far they move, pixels."""
-    lengths = np.linalg.norm(second - first, axis=2)
-    known = np.isfinite(lengths).all(axis=1)
-    result: npt.NDArray[np.float64] = np.full(len(lengths), np.nan)
-    result[known] = np.quantile(lengths[known], _PROBE_QUANTILE, axis=1)
+def displacement(first: Array, second: Array) -> Array:
+    """Return (...) the upper quartile over the probes (..., S, 2) of how far they move, pixels."""
+    lengths = np.linalg.norm(second - first, axis=-1)
+    known = np.isfinite(lengths).all(axis=-1)
+    result: npt.NDArray[np.float64] = np.full(known.shape, np.nan)
+    result[known] = np.quantile(lengths[known], _PROBE_QUANTILE, axis=-1)
     return result

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
+import posixpath
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +15,7 @@ from typing import Any
 from tooltip_cli.errors import MissingExtraError, TooltipError
 from tooltip_cli.stages.detect import SUFFIX as DETECTIONS
 from tooltip_cli.stages.moving import SUFFIX as EDGES
+from tooltip_cli.stages.shelf.store import Listing, Place, Remote, opened, place
 from tooltip_cli.stages.shelf.table import COLUMNS
 
 Cell = str | int | float | bool | None
@@ -26,9 +30,9 @@ class Item:
     """One recording of a shelf, and what the manifest says of it."""
 
     name: str  # unique in the shelf: its path below the shelf's root, without .mcap
-    recording: Path
-    rig: Path | None = None  # None: the default, or the one stored in the recording
-    labels: Path | None = None  # None: STEM.labels.csv where it usually lies
+    recording: Place
+    rig: Place | None = None  # None: the default, or the one stored in the recording
+    labels: Place | None = None  # None: STEM.labels.csv where it usually lies
     tool: str | None = None
     columns: Mapping[str, Cell] = field(default_factory=dict)  # any others of the manifest
 
@@ -38,37 +42,49 @@ class Shelf:
     """Recordings to work on, in the order of the folder or the manifest."""
 
     items: tuple[Item, ...]
-    out: Path  # where results go if nothing else is said
+    out: Place  # where results go if nothing else is said
+    listing: Listing = field(default_factory=Listing)  # of the buckets, as far as they were listed
 
 
 def read_shelf(shelf: str) -> Shelf:
     """List the recordings of a folder with its subfolders, a pattern, or a manifest.
 
-    A manifest is a CSV or Parquet table with the column ``recording``; ``rig``, ``labels`` and
-    ``tool`` may be empty or missing, any other columns are kept. Its paths are relative to it.
-    No recording is opened.
+    Each may be an address in a store, such as ``s3://bucket/folder``. A manifest is a CSV or
+    Parquet table with the column ``recording``; ``rig``, ``labels`` and ``tool`` may be empty or
+    missing, any other columns are kept. Its paths are relative to it. No recording is opened.
 
     Raises:
         TooltipError: nothing is there, or the manifest is malformed or names a recording twice.
     """
-    path = Path(shelf)
-    if path.is_dir():
-        shelf_of = Shelf(tuple(_items(_recordings_under(path), path)), path / "run")
-    elif path.suffix.lower() in _TABLES and path.is_file():
-        shelf_of = Shelf(tuple(_from_manifest(path)), path.parent / f"{path.stem}.run")
+    path, listing = place(shelf), Listing()
+    is_table = path.suffix.lower() in _TABLES
+    if (isinstance(path, Remote) and is_table) or (isinstance(path, Path) and path.is_file()):
+        if not is_table:
+            raise _no_shelf(shelf)
+        items: Iterable[Item] = _from_manifest(path)
+        out = path.parent / f"{path.stem}.run"
+    elif isinstance(path, Path) and path.is_dir():
+        items, out = _items(_recordings_under(path), path), path / "run"
     elif any(character in shelf for character in _WILD):
-        root = _fixed_part(shelf)
-        found = sorted(root.glob(str(Path(shelf).relative_to(root))))
-        files = (file for file in found if not _is_result(file.name) and file.is_file())
-        shelf_of = Shelf(tuple(_items(files, root)), root / "run")
+        root = _fixed_part(path)
+        items, out = _items(_matching(root, path, listing), root), root / "run"
+    elif isinstance(path, Remote):
+        listing.add_tree(path)
+        found = (item for item in listing.below(path) if _is_recording(item.name))
+        items, out = _items(found, path), path / "run"
     else:
-        raise TooltipError(
-            f"{shelf} is no folder, no pattern (such as 'logs/**/*.mcap', in quotes) and no "
-            "manifest (.csv or .parquet with the column 'recording')"
-        )
-    if not shelf_of.items:
+        raise _no_shelf(shelf)
+    found_items = tuple(items)
+    if not found_items:
         raise TooltipError(f"{shelf} holds no recording; expected files that end in .mcap")
-    return shelf_of
+    return Shelf(found_items, out, listing)
+
+
+def _no_shelf(shelf: str) -> TooltipError:
+    return TooltipError(
+        f"{shelf} is no folder, no pattern (such as 'logs/**/*.mcap', in quotes) and no "
+        "manifest (.csv or .parquet with the column 'recording')"
+    )
 
 
 def part_of(items: Sequence[Item], part: int, parts: int) -> tuple[Item, ...]:
@@ -86,35 +102,72 @@ def _recordings_under(folder: Path) -> Iterator[Path]:
     for parent, folders, names in os.walk(folder, followlinks=False):
         folders.sort()
         for name in sorted(names):
-            if name.endswith(".mcap") and not name.startswith(".") and not _is_result(name):
+            if _is_recording(name):
                 yield Path(parent) / name
+
+
+def _is_recording(name: str) -> bool:
+    return name.endswith(".mcap") and not name.startswith(".") and not _is_result(name)
 
 
 def _is_result(name: str) -> bool:
     return name.endswith(_RESULTS)
 
 
-def _fixed_part(pattern: str) -> Path:
-    """Return the folder before the first wildcard of a pattern."""
-    parts = Path(pattern).parts
+def _fixed_part(pattern: Place) -> Place:
+    """Return the folder before the first wildcard of a pattern.
+
+    Raises:
+        TooltipError: the name of a bucket is part of the pattern.
+    """
+    text = pattern.key if isinstance(pattern, Remote) else str(pattern)
+    parts = Path(text).parts
     wild = next(i for i, part in enumerate(parts) if any(char in part for char in _WILD))
-    return Path(*parts[:wild])
+    if isinstance(pattern, Path):
+        return Path(*parts[:wild])
+    if wild == 0:
+        raise TooltipError(f"{pattern}: the bucket has to be named; a pattern may follow it")
+    return Remote(pattern.url.removesuffix(pattern.key) + "/".join(parts[:wild]))
 
 
-def _items(recordings: Iterable[Path], root: Path) -> Iterator[Item]:
+def _matching(root: Place, pattern: Place, listing: Listing) -> Iterator[Place]:
+    """Yield the files of a pattern below its fixed part, in order."""
+    if isinstance(root, Path):
+        files: Iterable[Path] = sorted(root.glob(str(Path(str(pattern)).relative_to(root))))
+        yield from (file for file in files if not _is_result(file.name) and file.is_file())
+        return
+    listing.add_tree(root)
+    from fsspec.utils import glob_translate
+
+    matches = re.compile(glob_translate(str(pattern))).match
+    found = (item for item in listing.below(root) if matches(item.url))
+    yield from (item for item in found if not _is_result(item.name))
+
+
+def _items(recordings: Iterable[Place], root: Place) -> Iterator[Item]:
     for recording in recordings:
         yield Item(_name(recording, root), recording)
 
 
-def _name(recording: Path, root: Path) -> str:
-    """Return a recording's path below the root as a relative path that leaves no folder."""
-    path = Path(os.path.relpath(recording, root))
+def _name(recording: Place, root: Place) -> str:
+    """Return a recording's path below the root as a relative path that leaves no folder.
+
+    One that does not lie in the same store or disk as the root is named by its whole address.
+    """
+    if isinstance(recording, Remote):
+        near = isinstance(root, Remote) and root.url.split("/")[:3] == recording.url.split("/")[:3]
+        base = root.key if near and isinstance(root, Remote) else ""
+        path = Path(posixpath.relpath(f"/{recording.key}", f"/{base}"))
+    elif isinstance(root, Remote):
+        path = Path(os.path.relpath(recording, "/"))
+    else:
+        path = Path(os.path.relpath(recording, root))
     if path.suffix == ".mcap":
         path = path.with_suffix("")
     return "/".join("up" if part == ".." else part for part in path.parts)
 
 
-def _from_manifest(path: Path) -> Iterator[Item]:
+def _from_manifest(path: Place) -> Iterator[Item]:
     rows = _csv_rows(path) if path.suffix.lower() == ".csv" else _parquet_rows(path)
     seen: dict[str, int] = {}
     for line, row in rows:
@@ -135,16 +188,24 @@ def _from_manifest(path: Path) -> Iterator[Item]:
         yield Item(name, recording, rig, labels, _text(row.get("tool")), others)
 
 
-def _place(manifest: Path, row: Mapping[str, Any], column: str) -> Path | None:
+def _place(manifest: Place, row: Mapping[str, Any], column: str) -> Place | None:
     text = _text(row.get(column))
-    return None if text is None else manifest.parent / text
+    if text is None:
+        return None
+    named = place(text)
+    if isinstance(named, Remote) or isinstance(manifest, Path):
+        return named if isinstance(named, Remote) else manifest.parent / named
+    if named.is_absolute():
+        return named
+    below = posixpath.normpath(f"/{manifest.parent.key}/{named}")
+    return Remote(manifest.url.removesuffix(manifest.key) + below.lstrip("/"))
 
 
-def _first_line(path: Path) -> int:
+def _first_line(path: Place) -> int:
     return 2 if path.suffix.lower() == ".csv" else 1
 
 
-def _check_columns(path: Path, columns: Sequence[str]) -> None:
+def _check_columns(path: Place, columns: Sequence[str]) -> None:
     if "recording" not in columns:
         raise TooltipError(
             f"{path}: expected a column 'recording', found {', '.join(map(str, columns))[:200]}"
@@ -156,9 +217,10 @@ def _check_columns(path: Path, columns: Sequence[str]) -> None:
         )
 
 
-def _csv_rows(path: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:
+def _csv_rows(path: Place) -> Iterator[tuple[int, Mapping[str, Any]]]:
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with opened(path) as data:
+            file = io.TextIOWrapper(data, encoding="utf-8-sig", newline="")
             reader = csv.DictReader(file, strict=True)
             for row in reader:
                 if None in row or None in row.values():
@@ -171,14 +233,14 @@ def _csv_rows(path: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:
         raise TooltipError(f"{path}: cannot be read as a CSV manifest ({error})") from error
 
 
-def _parquet_rows(path: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:
+def _parquet_rows(path: Place) -> Iterator[tuple[int, Mapping[str, Any]]]:
     try:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
         raise MissingExtraError("a Parquet manifest", "shelf", "pyarrow") from None
     try:
-        with pyarrow.parquet.ParquetFile(path) as file:
+        with opened(path) as data, pyarrow.parquet.ParquetFile(data) as file:
             line = 0
             for batch in file.iter_batches():
                 for row in batch.to_pylist():

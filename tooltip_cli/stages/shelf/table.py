@@ -41,6 +41,7 @@ class Row:
     baseline_px: float | None = None  # of the estimate from the labels
     tip_error_mm: float | None = None  # to the true tip; simulated recordings only
     scored: int | None = None  # test frames with a visible label
+    rig_id: str | None = None  # the same for equal rigs and cameras, wherever they are stored
     recorded: str | None = None  # stamp of the first image, ISO 8601, UTC
     frames: int | None = None  # images
     bytes: int | None = None  # of the recording

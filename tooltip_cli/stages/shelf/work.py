@@ -20,7 +20,7 @@ from tooltip_cli.log.recording import Recording, Topics, read_recording
 from tooltip_cli.log.views import Views, resolve_rig, resolve_views
 from tooltip_cli.method.estimators import EstimatorParams
 from tooltip_cli.report.model import RecordingReport, mean_of
-from tooltip_cli.stages.artifacts import read_json, write_whole
+from tooltip_cli.stages.artifacts import digest, read_json
 from tooltip_cli.stages.detect import VERSION as DETECT_VERSION
 from tooltip_cli.stages.estimate import VERSION as ESTIMATE_VERSION
 from tooltip_cli.stages.estimate import Estimated, estimate_from_images
@@ -29,10 +29,12 @@ from tooltip_cli.stages.evaluate import Places, evaluate_recording
 from tooltip_cli.stages.measure import Protocol
 from tooltip_cli.stages.moving import VERSION as EDGES_VERSION
 from tooltip_cli.stages.shelf.plan import Item
+from tooltip_cli.stages.shelf.scratch import Bench, at_hand
+from tooltip_cli.stages.shelf.store import Place, Remote, Seen, look_at, place, read_some, write
 from tooltip_cli.stages.shelf.table import FAILED, OK, Row, row_from_document
 
 ROW = "row.json"
-VERSION = 1
+VERSION = 2
 VERSIONS = (VERSION, DETECT_VERSION, EDGES_VERSION, ESTIMATE_VERSION, EVALUATE_VERSION)
 """Of everything that a row is made by; a row of other versions is made anew."""
 _LOGGER = logging.getLogger(__name__)
@@ -43,13 +45,15 @@ class Task:
     """One recording to take through the stages; every path is absolute."""
 
     item: Item  # its labels are those that were found
-    folder: Path  # for everything that is written about it
+    folder: Place  # for everything that is written about it
     inputs: str  # digest of all that the row depends on
     topics: Topics
     params: EstimatorParams
     force: bool = False  # compute even where a fresh artifact exists
     trust: bool = True  # take a stored row with the same inputs for what it says
     version: str = __version__  # of the program that asks
+    seen: Seen | None = None  # of a recording in a bucket: what was listed
+    beside: tuple[Remote, ...] = ()  # in buckets: what else belongs to recording and labels
 
 
 def key_of(task: Task) -> str:
@@ -65,12 +69,36 @@ class Outcome:
     reused: bool
 
 
-def stored_row(folder: Path, inputs: str) -> Row | None:
+def stored_row(folder: Place, inputs: str) -> Row | None:
     """Return the row that was stored for these inputs, if it ended well and its tip is there.
 
     A failed row is not taken: what was missing then may be there now.
+
+    Raises:
+        TooltipError: the store that it lies in does not answer.
     """
-    document = read_json(folder / ROW)
+    if isinstance(folder, Path):
+        document = read_json(folder / ROW)
+    else:
+        document = parsed(next((data for _, data in read_some([folder / ROW])), None))
+    row = row_of(document, inputs, folder)
+    if row is None or row.tip_file is None:
+        return None
+    tip = place(row.tip_file)
+    there = tip.exists() if isinstance(tip, Path) else look_at(tip) is not None
+    return row if there else None
+
+
+def parsed(data: bytes | None) -> Any | None:
+    """Return what a JSON object holds; None where it is absent or not JSON."""
+    try:
+        return None if data is None else json.loads(data)
+    except (ValueError, RecursionError):
+        return None
+
+
+def row_of(document: Any, inputs: str, folder: Place) -> Row | None:
+    """Return the row of a stored document that was made from these inputs and did not fail."""
     if not isinstance(document, dict) or document.get("inputs") != inputs:
         return None
     try:
@@ -78,8 +106,7 @@ def stored_row(folder: Path, inputs: str) -> Row | None:
     except (KeyError, TooltipError):
         _LOGGER.info("%s cannot be read and is made anew", folder / ROW)
         return None
-    there = row.tip_file is not None and Path(row.tip_file).exists()
-    return row if there and row.status != FAILED else None
+    return None if row.status == FAILED else row
 
 
 def store_row(task: Task, row: Row) -> None:
@@ -89,7 +116,7 @@ def store_row(task: Task, row: Row) -> None:
         TooltipError: it cannot be written.
     """
     document = {"inputs": task.inputs, "row": asdict(row)}
-    write_whole(task.folder / ROW, json.dumps(document) + "\n")
+    write(task.folder / ROW, json.dumps(document) + "\n")
 
 
 def failed_row(task: Task, code: str, reason: str) -> Row:
@@ -118,15 +145,15 @@ def work_on(task: Task) -> Outcome:
     Whatever goes wrong is a row with its reason. The row is stored before it is returned, so that
     what is finished stays finished whatever happens to who asked for it.
     """
-    if task.trust:
-        row = stored_row(task.folder, task.inputs)
-        if row is not None:
-            return Outcome(row, True)
-    _one_thread()
     started = time.perf_counter()
     try:
+        if task.trust:
+            row = stored_row(task.folder, task.inputs)
+            if row is not None:
+                return Outcome(row, True)
+        _one_thread()
         _check_version(task)
-        outcome = _through_the_stages(task)
+        outcome = _at_hand(task)
     except TooltipError as error:
         outcome = Outcome(failed_row(task, "failed", str(error)), False)
     except MemoryError:
@@ -144,6 +171,25 @@ def work_on(task: Task) -> Outcome:
     return outcome
 
 
+def _at_hand(task: Task) -> Outcome:
+    """Do the work on files of this machine, and say of them where they come from."""
+    with at_hand(task.item, task.folder, task.seen, task.beside, anew=task.force) as bench:
+        try:
+            outcome = _through_the_stages(task, bench)
+        except TooltipError as error:
+            raise TooltipError(bench.said(str(error))) from error
+        bench.keep()
+        row = outcome.row
+        return replace(
+            outcome,
+            row=replace(
+                row,
+                reason=None if row.reason is None else bench.said(row.reason),
+                tip_file=None if row.tip_file is None else bench.said(row.tip_file),
+            ),
+        )
+
+
 def _check_version(task: Task) -> None:
     if task.version != __version__:
         raise TooltipError(
@@ -159,16 +205,17 @@ def _one_thread() -> None:
     cv2.setNumThreads(1)
 
 
-def _through_the_stages(task: Task) -> Outcome:
-    item, started = task.item, time.perf_counter()
-    recording = read_recording(item.recording, task.topics)
-    views = resolve_views(recording, resolve_rig(recording, item.rig))
+def _through_the_stages(task: Task, bench: Bench) -> Outcome:
+    started = time.perf_counter()
+    recording = read_recording(bench.recording, task.topics)
+    rig = resolve_rig(recording, bench.rig)
+    views = resolve_views(recording, rig)
     found = estimate_from_images(
         recording,
         views,
         task.params,
-        _not_labelled(recording, views, item.labels),
-        out=task.folder,
+        _not_labelled(recording, views, bench.labels),
+        out=bench.folder,
         force=task.force,
     )
     seconds = _since(started)
@@ -176,14 +223,15 @@ def _through_the_stages(task: Task) -> Outcome:
         _bare_row(task),
         **_of_recording(recording),
         **_of_estimate(found),
+        rig_id=digest((replace(rig, source=""), views.camera))[:12],
         seconds_estimate=seconds,
     )
-    if item.labels is None:
+    if bench.labels is None:
         return Outcome(row, found.reused)
     started = time.perf_counter()
     evaluated = evaluate_recording(
-        item.recording,
-        Places(task.folder, task.folder, item.labels, None, item.rig),
+        bench.recording,
+        Places(bench.folder, bench.folder, bench.labels, None, bench.rig),
         Protocol(params=task.params, curve=False),
         task.topics,
         task.force,
