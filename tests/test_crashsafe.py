@@ -39,7 +39,7 @@ def noise(stamp_ns: int, size: int = 300_000) -> Message:
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
-    for _ in range(2000):
+    for _ in range(12_000):
         if condition():
             return
         time.sleep(0.005)
