@@ -40,6 +40,7 @@ class FoundEnd:
 
     candidate: Candidate
     agreement: float  # share of what the images show of it that fits; 0: too few images do
+    by_grip: bool = False  # whether only its distance from the grip makes it an end
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,7 @@ class _Rough:
     far: Array  # (3,) metres, hand frame: the voxel of it that is farthest from wrist or grip
     voted: ToolEnd | None
     solid: tuple[ToolEnd, ...]  # as the hull has it
+    by_grip: bool = False  # whether it is the farthest from the grip alone
 
 
 def find_ends(
@@ -72,7 +74,7 @@ def find_ends(
             by_edges = _by_edges(edges, cloud, rough.far, rough.voted, spheres, settings)
             end = by_edges if end is None or by_edges.agreement > end.agreement else end
         if end is not None:
-            ends.append(end)
+            ends.append(replace(end, by_grip=rough.by_grip))
     return _apart(ends, grip_of(spheres), settings.end)
 
 
@@ -82,17 +84,18 @@ def _apart(ends: list[FoundEnd], grip: Array, params: EndParams) -> list[FoundEn
     One that far fewer images show, or agree on, than on another is no end that could be meant.
     """
     kept: list[FoundEnd] = []
-    for end in sorted(ends, key=lambda item: -item.agreement):
+    for end in sorted(ends, key=lambda item: (item.by_grip, -item.agreement)):
         apart = [end.candidate.position - other.candidate.position for other in kept]
         if all(np.linalg.norm(away) > 0.5 * params.end_separation for away in apart):
             kept.append(end)
     share = params.other_end_support
-    agreement = share * max(end.agreement for end in kept)
-    support = share * max(end.candidate.support for end in kept)
+    best = [end for end in kept if not end.by_grip] or kept
+    agreement = share * max(end.agreement for end in best)
+    support = share * max(end.candidate.support for end in best)
     kept = [
         end for end in kept if end.agreement >= agreement and end.candidate.support >= support
     ] or kept[:1]
-    kept.sort(key=lambda end: -float(np.linalg.norm(end.candidate.position)))
+    kept.sort(key=lambda end: (end.by_grip, -float(np.linalg.norm(end.candidate.position))))
     first = kept[0].candidate.position
     least, from_grip = params.other_end_share * np.linalg.norm(first), np.linalg.norm(first - grip)
     return [
@@ -108,38 +111,42 @@ def _rough_ends(
 ) -> list[_Rough]:
     params, same, grip = settings.end, settings.outline.same_end, grip_of(spheres)
     votes = [
-        (shape.voxels[far], locate_end(cloud, shape, shape.voxels[far], spheres, params))
-        for far in _both_ways(shape, grip, settings)
+        (shape.voxels[far], locate_end(cloud, shape, shape.voxels[far], spheres, params), by_grip)
+        for far, by_grip in _both_ways(shape, grip, settings)
     ]
     silhouettes = edges.silhouettes
     rough: list[_Rough] = []
     if silhouettes is not None:
         hull = visual_hull(silhouettes, spheres, edges.reach, settings.hull)
         sure = _confirmed(hull, shape, settings.hull.confirmed)
-        bulges = [hull.voxels[row] for row in _both_ways(hull, grip, settings)]
-        for row in _both_ways(sure, grip, settings):
+        bulges = [hull.voxels[row] for row, _ in _both_ways(hull, grip, settings)]
+        for row, by_grip in _both_ways(sure, grip, settings):
             far = sure.voxels[row]
-            near = [end for at, end in votes if np.linalg.norm(at - far) < same]
+            near = [end for at, end, _ in votes if np.linalg.norm(at - far) < same]
             solid = [locate_hull_end(sure, far, spheres, params)]
             solid += [
                 locate_hull_end(hull, bulge, spheres, params)
                 for bulge in bulges
                 if np.linalg.norm(bulge - far) < same
             ]
-            rough.append(_Rough(far, near[0] if near else None, tuple(solid)))
-    for far, end in votes:
+            rough.append(_Rough(far, near[0] if near else None, tuple(solid), by_grip))
+    for far, end, by_grip in votes:
         if all(np.linalg.norm(far - other.far) >= same for other in rough):
-            rough.append(_Rough(far, end, ()))
+            rough.append(_Rough(far, end, (), by_grip))
     return rough
 
 
-def _both_ways(shape: Shape, grip: Array, settings: VotingSettings) -> list[int]:
-    """Return voxels that are far from the wrist, and the one that is farthest from the grip."""
-    rows = [int(row) for row in far_voxels(shape, settings.end)]
+def _both_ways(shape: Shape, grip: Array, settings: VotingSettings) -> list[tuple[int, bool]]:
+    """Return voxels that are far from the wrist, and the one that is farthest from the grip.
+
+    Returns:
+        rows, and whether each is there for the grip alone.
+    """
+    rows = [(int(row), False) for row in far_voxels(shape, settings.end)]
     for row in far_voxels(shape, settings.end, grip)[:1]:
-        apart = np.linalg.norm(shape.voxels[rows] - shape.voxels[row], axis=1)
+        apart = np.linalg.norm(shape.voxels[[at for at, _ in rows]] - shape.voxels[row], axis=1)
         if (apart >= settings.outline.same_end).all():
-            rows.append(int(row))
+            rows.append((int(row), True))
     return rows
 
 
