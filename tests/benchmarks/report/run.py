@@ -4,7 +4,7 @@
 
 FOLDER is where the paper's ten tools are simulated and taken through detection once; a later run
 finds them there. What is timed is `tooltip evaluate` in a process of its own, from stored
-detections and estimates but without any part of a report.
+detections and estimates, those from fewer frames among them, but without any part of a report.
 """
 
 from __future__ import annotations
