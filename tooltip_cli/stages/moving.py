@@ -41,7 +41,7 @@ from tooltip_cli.stages.scene import Scene
 from tooltip_cli.stages.threads import in_order
 
 SUFFIX = ".edges.mcap"
-VERSION = 2
+VERSION = 3
 _FRAMES_A_TASK = 16
 _NOISE_PAIRS = 8
 _LOGGER = logging.getLogger(__name__)

@@ -26,7 +26,7 @@ Map = npt.NDArray[np.float32]
 
 _MEMORY = 100_000_000  # bytes that all samples may take together
 _FEWEST_SAMPLES = 9
-_STILL_PX = 0.05  # a camera that turns by less than this is still
+_STILL_PX = 2.0  # less is what joint encoders make up: turning images by it would blur the scene
 _GRID = (33, 25)  # columns and rows at which a camera's turn is computed, the rest interpolated
 _OUTSIDE = -1e4  # a pixel that no image has
 
