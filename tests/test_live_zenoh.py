@@ -116,18 +116,21 @@ def test_publisher_and_router_may_go_and_come_back(router: Router, tmp_path: Pat
     out = tmp_path / "out.mcap"
     names = ("--image", IMAGE, "--joints", STATES, "--reconnect")
     listener = recorder("zenoh", out, "--router", router.address, *names)
-    first = robot(router, "jpeg", 64, 48, 30, 100, 60)
-    wait_for(grown(out, 20_000), "a recording")
+    first = robot(router, "jpeg", 320, 240, 30, 100, 60)
+    wait_for(grown(out, 100_000), "a recording")
+    maps = Path(f"/proc/{listener.pid}/maps")
+    # what is mapped of a publisher stays when that has gone
+    assert not maps.exists() or ".zenoh" not in maps.read_text()
     first.kill()
     first.communicate()
     router.stop()
     time.sleep(2)  # so that the silence is noticed
     router.start()
-    second = robot(router, "jpeg", 64, 48, 30, 100, 1.5)
+    second = robot(router, "jpeg", 320, 240, 30, 100, 1.5)
     second.communicate(timeout=90)
     err = ended(listener, signal.SIGINT)
     payloads = [m.payload for m in by_topic(out)[IMAGE]]
-    assert payloads.count(image_payload("jpeg", 64, 48, 0)) >= 2
+    assert payloads.count(image_payload("jpeg", 320, 240, 0)) >= 2
     assert f"nothing on {IMAGE} any more" in err
     assert f"{IMAGE} is heard again after" in err
 
@@ -188,6 +191,26 @@ def test_what_the_network_lost_or_is_no_cdr_is_counted(router: Router, peer: Any
         f"messages on {STATES} that were lost on the way here": 3,
         f"messages on {STATES} that are not plain CDR": 1,
     }
+
+
+def test_no_thread_is_left_that_would_take_a_sample(router: Router) -> None:
+    """One that is still on its way out when the interpreter ends aborts the process."""
+    bus, halt, before = ZenohBus(0, router.address), threading.Event(), set(threading.enumerate())
+    topics = [HeardTopic(f"/{i}", messages.STRING, latched=i % 2 == 0) for i in range(20)]
+    receivers = [bus.receiver(topic, ArrivalClock(), SourceReport()) for topic in topics]
+    threads = [
+        threading.Thread(target=receiver.run, args=(lambda message: None, halt), daemon=True)
+        for receiver in receivers
+    ]
+    for thread in threads:
+        thread.start()
+    wait_for(lambda: len(set(threading.enumerate()) - before) == 2 * len(threads), "all to listen")
+    halt.set()
+    for thread in threads:
+        thread.join()
+    assert set(threading.enumerate()) == before
+    bus.heard(0.1)
+    assert set(threading.enumerate()) == before
 
 
 def test_without_a_router_the_line_says_what_to_do(tmp_path: Path) -> None:

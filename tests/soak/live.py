@@ -120,6 +120,7 @@ def report(
         "memory_early_mb": round(early / 1e6, 1),
         "memory_late_mb": round(late / 1e6, 1),
         "memory_max_mb": round(max(memory) / 1e6, 1),
+        "memory_by_minute_mb": [round(size / 1e6, 1) for size in memory[::60]],
         "growth": round(late / early - 1, 4),
         "processor_s": round(used_s, 1),
         "log_mb": round(size / 1e6),

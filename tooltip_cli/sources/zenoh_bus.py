@@ -13,12 +13,13 @@ Source: rmw_zenoh's design document; its ``liveliness_utils`` and ``attachment_h
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import struct
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ ROUTER = "tcp/localhost:7447"
 """Where rmw_zenoh's router listens, seen from the robot itself."""
 
 _CONNECT_MS = 5000
+_LEAVE_S = 2.0  # for a thread of Zenoh's to end
 _TOKEN_PARTS = 13
 _RELIABLE, _TRANSIENT_LOCAL = ("", "1"), "1"  # in a token; reliable is rmw_zenoh's default
 _KEPT = 1000  # messages of a latched topic, at most as many as its publishers keep
@@ -55,6 +57,32 @@ def _zenoh() -> Any:
     except ImportError as error:
         raise missing_extra(FEATURE, EXTRA, error) from error
     return zenoh
+
+
+@contextlib.contextmanager
+def _heard_by(take: Callable[[Any], None], declare: Callable[[Any], Any]) -> Iterator[None]:
+    """Let ``take`` have every sample, in a thread of Zenoh's; that has ended when this is left.
+
+    Zenoh does not wait for it. An interpreter that ends while the thread is on its way out, or that
+    runs it as a daemon, for such a one declared the subscriber, aborts.
+
+    Args:
+        take: called with samples.
+        declare: returns the subscriber of a handler.
+    """
+    gone, threads = threading.Event(), list[threading.Thread]()
+
+    def leave() -> None:
+        threads.append(threading.current_thread())
+        gone.set()
+
+    subscriber = declare(_zenoh().handlers.Callback(take, leave))
+    try:
+        yield
+    finally:
+        subscriber.undeclare()
+        if gone.wait(_LEAVE_S):
+            threads[0].join(_LEAVE_S)
 
 
 def topic_of_token(token: str) -> HeardTopic | None:
@@ -121,15 +149,17 @@ class ZenohBus:
                 alive[token] = topic
                 changed.set()
 
-        tokens = self._session.liveliness().declare_subscriber(
-            f"@ros2_lv/{self._domain}/**", note, history=True
-        )
-        end = time.monotonic() + wait_s
-        while changed.wait(max(end - time.monotonic(), 0)) and time.monotonic() < end:
-            changed.clear()
-            if not changed.wait(SETTLED_S):
-                break
-        tokens.undeclare()
+        def declare(handler: Any) -> Any:
+            return self._session.liveliness().declare_subscriber(
+                f"@ros2_lv/{self._domain}/**", handler, history=True
+            )
+
+        with _heard_by(note, declare):
+            end = time.monotonic() + wait_s
+            while changed.wait(max(end - time.monotonic(), 0)) and time.monotonic() < end:
+                changed.clear()
+                if not changed.wait(SETTLED_S):
+                    break
         found: dict[tuple[str, str], HeardTopic] = {}
         for topic in list(alive.values()):
             before = found.get((topic.name, topic.datatype), topic)
@@ -174,6 +204,9 @@ def _configuration(zenoh: Any, router: str | None, config: Path | None) -> Any:
     settings.insert_json5("connect/endpoints", json.dumps([router or ROUTER]))
     settings.insert_json5("connect/timeout_ms", str(_CONNECT_MS))
     settings.insert_json5("scouting/multicast/enabled", "false")
+    # a subscriber keeps what it has mapped of a publisher when that has gone: 2 MB of its own, and
+    # shared ones, for each start of a robot (eclipse-zenoh 1.10)
+    settings.insert_json5("transport/shared_memory/enabled", "false")
     return settings
 
 
@@ -202,20 +235,21 @@ class _TopicReceiver:
             if message is not None:
                 deliver(message)
 
+        def declare(handler: Any) -> Any:
+            if not self._topic.latched:
+                return self._session.declare_subscriber(self._key, handler)
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=_KEPT)
+            return zenoh.ext.declare_advanced_subscriber(
+                self._session, self._key, handler, history=history
+            )
+
         try:
-            if self._topic.latched:
-                history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=_KEPT)
-                subscriber = zenoh.ext.declare_advanced_subscriber(
-                    self._session, self._key, take, history=history
-                )
-            else:
-                subscriber = self._session.declare_subscriber(self._key, take)
+            with _heard_by(take, declare):
+                halt.wait()
         except zenoh.ZError as error:
             raise TooltipError(
                 f"{self._topic.name} cannot be subscribed to ({_reason(error)})"
             ) from error
-        halt.wait()
-        subscriber.undeclare()
 
     def _message(self, sample: Any) -> Message | None:
         arrival_ns = self._clock.now_ns()
