@@ -11,8 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,46 +20,14 @@ import pytest
 from tests.helpers.cli import tooltip
 from tests.helpers.live import MjpegServer, free_port, joint_line, udp_joints
 from tests.helpers.logs import FRAME_NS, START_NS, angles, jpeg_of
+from tests.helpers.recorder import by_topic, ended, recorder, results
 from tests.helpers.robot import JOINTS, RIG
 from tooltip_cli.errors import TooltipError
-from tooltip_cli.log.container import LoggedMessage, iterate
 from tooltip_cli.log.messages import decode, ns_from_time
-from tooltip_cli.rig.rigfile import rig_files
 from tooltip_cli.sources.joints import JointSample, joint_samples, sample_from_json
+from tooltip_cli.stages.calibrate import write_rig
 
-ROOT = Path(__file__).parents[1]
 IMAGES, STATES = "/camera/image/compressed", "/joint_states"
-
-
-def messages_in(path: Path, topic: str) -> list[LoggedMessage]:
-    return [m for m in iterate(path) if isinstance(m, LoggedMessage) and m.topic == topic]
-
-
-def write_rig(folder: Path) -> Path:
-    for name, text in rig_files(replace(RIG)).items():
-        (folder / name).write_text(text)
-    return folder / "rig.yaml"
-
-
-class Recording:
-    """A real ``tooltip record camera`` process."""
-
-    def __init__(self, out: Path, *arguments: object) -> None:
-        command = [sys.executable, "-m", "tooltip_cli.cli.main", "record", "camera", out]
-        self.out = out
-        self.process = subprocess.Popen(
-            [str(item) for item in (*command, *arguments)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            cwd=ROOT,
-        )
-
-    def end(self, number: int | None = None) -> tuple[int, str, str]:
-        if number is not None:
-            self.process.send_signal(number)
-        out, err = self.process.communicate(timeout=60)
-        return self.process.returncode, out, err
 
 
 @pytest.fixture
@@ -70,21 +37,14 @@ def server() -> Iterator[MjpegServer]:
     server.close()
 
 
-def wait_for(condition: Callable[[], bool], what: str) -> None:
-    for _ in range(3000):
-        if condition():
-            return
-        time.sleep(0.01)
-    raise AssertionError(f"{what} did not happen")
-
-
 def test_what_is_sent_is_recorded_byte_for_byte_with_both_clocks(
     tmp_path: Path, server: MjpegServer
 ) -> None:
     port = free_port(socket.SOCK_DGRAM)
-    rig = write_rig(tmp_path)
+    rig = write_rig(RIG, tmp_path)
     sources = ("--camera", server.url, "--joints", f"udp://127.0.0.1:{port}", "--rig", rig)
-    recording = Recording(tmp_path / "out.mcap", *sources)
+    out = tmp_path / "out.mcap"
+    recording = recorder("camera", out, *sources)
     assert server.connected.wait(30)
     before_ns = time.time_ns()
     stamps: list[int] = []
@@ -97,16 +57,16 @@ def test_what_is_sent_is_recorded_byte_for_byte_with_both_clocks(
         send(b"no json\n")
         send(b'{"positions": {"a": "far"}}\n')
         time.sleep(0.3)
-    code, out, err = recording.end(signal.SIGINT)
-    assert (code, out) == (0, f"{recording.out}\n"), err
-    images = messages_in(recording.out, IMAGES)
+    printed, err = results(recording, signal.SIGINT)
+    assert printed == f"{out}\n"
+    images = by_topic(out)[IMAGES]
     sent = [jpeg_of(i) + bytes([i]) for i in range(40)]
     assert [bytes(decode(m.datatype, m.payload).data) for m in images] == sent
     for message in images:
         stamp_ns = ns_from_time(decode(message.datatype, message.payload).header.stamp)
         assert stamp_ns == message.log_time_ns
         assert abs(stamp_ns - before_ns) < 30e9
-    states = messages_in(recording.out, STATES)
+    states = by_topic(out)[STATES]
     assert [decode(m.datatype, m.payload).position[0] for m in states] == [
         0.01 * i for i in range(40)
     ]
@@ -115,29 +75,30 @@ def test_what_is_sent_is_recorded_byte_for_byte_with_both_clocks(
     assert "left out 1 lines that are not JSON" in err
     assert "left out 1 lines with a position that is no number" in err
     assert re.search(r"motion: (keep going|tilt the wrist)", err)  # about one axis only
-    assert len(messages_in(recording.out, "/robot_description")) == 1
-    info = json.loads(tooltip("info", recording.out, "--json").out)
+    assert len(by_topic(out)["/robot_description"]) == 1
+    info = json.loads(tooltip("info", out, "--json").out)
     assert info["state"] == "whole"
 
 
 def test_a_camera_that_is_lost_ends_the_recording_with_a_line(
     tmp_path: Path, server: MjpegServer
 ) -> None:
-    recording = Recording(tmp_path / "out.mcap", "--camera", server.url)
+    out = tmp_path / "out.mcap"
+    recording = recorder("camera", out, "--camera", server.url)
     assert server.connected.wait(30)
     for i in range(3):
         server.show(jpeg_of(i))
     server.show(b"")  # hangs up
-    code, _, err = recording.end()
-    assert code == 0
+    err = ended(recording)
     assert "ended: the camera has ended" in err
     assert "no joint angles" in err
-    assert len(messages_in(recording.out, IMAGES)) == 3
+    assert len(by_topic(out)[IMAGES]) == 3
 
 
 def test_a_camera_that_comes_back_is_waited_for(tmp_path: Path) -> None:
     first = MjpegServer(lengths=False)
-    recording = Recording(tmp_path / "out.mcap", "--camera", first.url, "--reconnect")
+    out = tmp_path / "out.mcap"
+    recording = recorder("camera", out, "--camera", first.url, "--reconnect")
     assert first.connected.wait(30)
     for i in range(3):
         first.show(jpeg_of(i))
@@ -147,11 +108,10 @@ def test_a_camera_that_comes_back_is_waited_for(tmp_path: Path) -> None:
     for i in range(3, 5):
         second.show(jpeg_of(i))
     time.sleep(0.5)
-    code, _, err = recording.end(signal.SIGTERM)
+    err = ended(recording, signal.SIGTERM)
     second.close()
-    assert code == 0
     assert "the camera has ended; waiting for it" in err
-    images = messages_in(recording.out, IMAGES)
+    images = by_topic(out)[IMAGES]
     data = [bytes(decode(m.datatype, m.payload).data) for m in images]
     # without lengths an image ends where the next begins: the last before a break is whole too
     assert data == [jpeg_of(i) for i in range(5)]
@@ -169,48 +129,47 @@ def test_a_camera_that_is_not_there_leaves_no_file(tmp_path: Path) -> None:
 
 def test_silence_ends_the_recording(tmp_path: Path, server: MjpegServer) -> None:
     out = tmp_path / "out.mcap"
-    recording = Recording(out, "--camera", server.url, "--patience", 1)
+    recording = recorder("camera", out, "--camera", server.url, "--patience", 1)
     assert server.connected.wait(30)
     server.show(jpeg_of(0))
-    code, _, err = recording.end()
-    assert code == 0
+    err = ended(recording)
     assert f"ended: no image on {IMAGES} for 1 s" in err
-    assert len(messages_in(out, IMAGES)) == 1
+    assert len(by_topic(out)[IMAGES]) == 1
 
 
 def test_missing_joints_are_reported_and_images_kept(tmp_path: Path, server: MjpegServer) -> None:
     port = free_port(socket.SOCK_DGRAM)
     options = ("--joints", f"udp://127.0.0.1:{port}", "--duration", 1.5)
-    recording = Recording(tmp_path / "out.mcap", "--camera", server.url, *options)
+    out = tmp_path / "out.mcap"
+    recording = recorder("camera", out, "--camera", server.url, *options)
     assert server.connected.wait(30)
     for i in range(25):
         server.show(jpeg_of(i))
         time.sleep(0.1)
-    code, _, err = recording.end()
-    assert code == 0
+    err = ended(recording)
     assert f"nothing on {STATES} yet" in err
-    assert messages_in(recording.out, IMAGES)
+    assert by_topic(out)[IMAGES]
 
 
 def test_an_mpeg_ts_stream_over_udp(tmp_path: Path) -> None:
     av = pytest.importorskip("av")
     port = free_port(socket.SOCK_DGRAM)
     url = f"udp://127.0.0.1:{port}"
-    recording = Recording(tmp_path / "out.mcap", "--camera", url, "--duration", 1)
+    out = tmp_path / "out.mcap"
+    recording = recorder("camera", out, "--camera", url, "--duration", 1)
     with av.open(url, "w", format="mpegts") as container:
         stream = container.add_stream("mpeg2video", rate=25)
         stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
         stream.gop_size = 5
         pixels = np.full((120, 160, 3), 90, dtype=np.uint8)
         for _ in range(1500):
-            if recording.process.poll() is not None:
+            if recording.poll() is not None:
                 break
             for packet in stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")):
                 container.mux(packet)
             time.sleep(0.02)
-    code, _, err = recording.end()
-    assert code == 0, err
-    images = messages_in(recording.out, IMAGES)
+    ended(recording)
+    images = by_topic(out)[IMAGES]
     assert len(images) > 5
     stamps = [m.log_time_ns for m in images]
     assert stamps == sorted(set(stamps))
@@ -220,14 +179,14 @@ def test_an_mpeg_ts_stream_over_udp(tmp_path: Path) -> None:
 def test_a_stream_of_ffmpeg_is_taken_without_its_backlog(tmp_path: Path) -> None:
     port = free_port(socket.SOCK_DGRAM)
     url = f"udp://127.0.0.1:{port}"
-    recording = Recording(tmp_path / "out.mcap", "--camera", url, "--duration", 2)
+    out = tmp_path / "out.mcap"
+    recording = recorder("camera", out, "--camera", url, "--duration", 2)
     picture = ["-f", "lavfi", "-i", "testsrc=size=160x120:rate=25", "-t", "60"]
     coded = ["-c:v", "mpeg2video", "-g", "5", "-f", "mpegts", f"{url}?pkt_size=1316"]
     with subprocess.Popen(["ffmpeg", "-loglevel", "error", "-re", *picture, *coded]) as sender:
-        code, _, err = recording.end()
+        ended(recording)
         sender.kill()
-    assert code == 0, err
-    stamps = [m.log_time_ns for m in messages_in(recording.out, IMAGES)]
+    stamps = [m.log_time_ns for m in by_topic(out)[IMAGES]]
     # in 2 s at 25 Hz; what waited in the stream while it was opened would come on top, at once
     assert 10 < len(stamps) < 60
     assert stamps == sorted(set(stamps))
@@ -236,7 +195,8 @@ def test_a_stream_of_ffmpeg_is_taken_without_its_backlog(tmp_path: Path) -> None
 def test_stamps_of_another_clock_are_pointed_out(tmp_path: Path, server: MjpegServer) -> None:
     port = free_port(socket.SOCK_DGRAM)
     sources = ("--camera", server.url, "--joints", f"udp://127.0.0.1:{port}")
-    recording = Recording(tmp_path / "out.mcap", *sources)
+    out = tmp_path / "out.mcap"
+    recording = recorder("camera", out, *sources)
     assert server.connected.wait(30)
     server.show(jpeg_of(0))
     with udp_joints(port) as send:
@@ -244,32 +204,31 @@ def test_stamps_of_another_clock_are_pointed_out(tmp_path: Path, server: MjpegSe
             send(joint_line({"a": 0.0}, 1_700_000_000_000_000_000))
             time.sleep(0.02)
     time.sleep(0.3)
-    _, _, err = recording.end(signal.SIGINT)
+    err = ended(recording, signal.SIGINT)
     assert err.count("give --joint-stamps arrival") == 1
 
 
 def test_until_enough_ends_by_itself(tmp_path: Path, server: MjpegServer) -> None:
     port = free_port(socket.SOCK_DGRAM)
     sources = ("--camera", server.url, "--joints", f"udp://127.0.0.1:{port}")
-    rig = write_rig(tmp_path)
-    recording = Recording(tmp_path / "out.mcap", *sources, "--rig", rig, "--until-enough", "--json")
+    rig = write_rig(RIG, tmp_path)
+    out = tmp_path / "out.mcap"
+    recording = recorder("camera", out, *sources, "--rig", rig, "--until-enough", "--json")
     assert server.connected.wait(30)
     with udp_joints(port) as send:
         for i in range(20_000):
-            if recording.process.poll() is not None:
+            if recording.poll() is not None:
                 break
             # by number, not by time: no load of the machine makes the wrist faster
             pitch, roll = angles(START_NS + i * FRAME_NS)
             send(joint_line({JOINTS[0]: pitch, JOINTS[1]: roll}, None))
             server.show(jpeg_of(0))
             time.sleep(0.005)
-    code, out, err = recording.end()
-    assert code == 0, err
-    document = json.loads(out)
+    document = json.loads(results(recording)[0])
     assert document["motion"]["verdict"] == "enough"
     assert document["motion"]["frames"] == 200
     assert "ended: the motion is enough" in document["notes"]
-    info = json.loads(tooltip("info", recording.out, "--json").out)
+    info = json.loads(tooltip("info", out, "--json").out)
     assert info["usable_frames"] * document["read"][IMAGES] >= 190
 
 

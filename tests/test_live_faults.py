@@ -20,7 +20,7 @@ import pytest
 from tests.helpers.live import MjpegServer, free_port, joint_line, udp_joints
 from tests.helpers.logs import IMAGE_TOPIC, JOINT_TOPIC, image_message, joint_message, jpeg_of
 from tests.helpers.recorder import ROOT, by_topic, ended, interruptible, recorder, wait_for
-from tests.helpers.robot import JOINTS
+from tests.helpers.robot import JOINTS, RIG
 from tests.helpers.robots import SYSTEM_PYTHON, has_ros1, ros1_environment
 from tests.helpers.ros2_robot import IMAGE, STATES
 from tests.test_live_recording import Robot
@@ -29,6 +29,7 @@ from tooltip_cli.log.crashsafe import CrashSafeWriter
 from tooltip_cli.log.messages import Message, decode, ns_from_time
 from tooltip_cli.log.stopping import Stop
 from tooltip_cli.sources.live import Deliver
+from tooltip_cli.stages.calibrate import write_rig
 from tooltip_cli.stages.live import LiveOptions, record_live
 
 CUT_S = 5.0
@@ -244,16 +245,15 @@ def test_a_message_that_is_not_of_its_topics_type_is_kept_and_told(tmp_path: Pat
     """Anything may go by the name of JointState; its bytes are stored all the same."""
     pytest.importorskip("zenoh")
     from tests.helpers.robots import Router
-    from tests.helpers.zenoh_robot import Publisher, session
-    from tests.test_live_camera import write_rig
+    from tests.helpers.zenoh_robot import Publisher, heard, session
 
     router, out = Router(), tmp_path / "out.mcap"
     peer = session("peer", connect=router.address)
     images = Publisher(peer, IMAGE, messages.COMPRESSED_IMAGE)
     states = Publisher(peer, STATES, messages.JOINT_STATE)
-    rig = write_rig(tmp_path)
+    rig = write_rig(RIG, tmp_path)
     listener = recorder("zenoh", out, "--router", router.address, "--rig", rig)
-    wait_for(lambda: bool(images.publisher.matching_status.matching), "a subscription")
+    wait_for(lambda: heard(images, states), "a subscription to both")
     wrong = b"\x00\x01\x00\x00" + b"\xff" * 40
     for i in range(20):
         images.send(messages.compressed_image(10**18 + i * 10**7, "camera", "jpeg", jpeg_of(i)))

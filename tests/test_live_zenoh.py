@@ -31,7 +31,7 @@ from tests.helpers.ros2_robot import (
     image_payload,
     joint_payload,
 )
-from tests.helpers.zenoh_robot import Publisher, session
+from tests.helpers.zenoh_robot import Publisher, heard, session
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.log import messages
 from tooltip_cli.sources.base import SourceReport
@@ -100,7 +100,7 @@ def test_topics_are_found_and_latched_ones_are_read(
     described = Publisher(peer, ROBOT, messages.STRING, zenoh_robot.LATCHED)
     described.send(messages.string(URDF))
     listener = recorder("zenoh", tmp_path / "out.mcap", "--router", router.address)
-    wait_for(lambda: bool(images.publisher.matching_status.matching), "a subscription")
+    wait_for(lambda: heard(images, states), "a subscription to both")
     for i in range(50):
         images.send(image_payload("jpeg", 32, 24, i))
         states.send(joint_payload(i))
@@ -109,6 +109,7 @@ def test_topics_are_found_and_latched_ones_are_read(
     ended(listener, signal.SIGINT)
     found = by_topic(tmp_path / "out.mcap")
     assert set(found) == {IMAGE, STATES, ROBOT}
+    assert len(found[IMAGE]) == len(found[STATES]) == 50
     assert [m.payload for m in found[ROBOT]] == [messages.string(URDF)]
 
 
@@ -175,7 +176,7 @@ def test_what_the_network_lost_or_is_no_cdr_is_counted(router: Router, peer: Any
         target=receiver.run, args=(lambda message: taken.append(message.payload), halt)
     )
     thread.start()
-    wait_for(lambda: bool(states.publisher.matching_status.matching), "a subscription")
+    wait_for(lambda: heard(states), "a subscription")
     states.send(joint_payload(0))
     states.number += 3  # as if three had been sent
     states.send(joint_payload(1))

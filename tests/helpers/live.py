@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.helpers.recorder import wait_for
 from tooltip_cli.log import messages
 from tooltip_cli.log.container import LoggedMessage, iterate
 from tooltip_cli.log.messages import decode, ns_from_time
@@ -117,9 +118,26 @@ def free_port(kind: int = socket.SOCK_STREAM) -> int:
 
 @contextmanager
 def udp_joints(port: int) -> Iterator[Callable[[bytes], object]]:
-    """Yield what sends a datagram to a port of this machine."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        yield lambda line: sender.sendto(line, ("127.0.0.1", port))
+    """Yield what sends a datagram to a port of this machine; the first waits until one listens."""
+    place, heard = ("127.0.0.1", port), False
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe,
+    ):
+        probe.connect(place)
+
+        def listening() -> bool:
+            probe.send(b"\n")  # an empty line is no sample
+            return probe.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) == 0
+
+        def send(line: bytes) -> None:
+            nonlocal heard
+            if not heard:
+                wait_for(listening, "somebody who listens to joints")
+                heard = True
+            sender.sendto(line, place)
+
+        yield send
 
 
 def play(

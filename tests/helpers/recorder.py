@@ -26,19 +26,25 @@ def recorder(kind: str, out: Path, *arguments: object) -> subprocess.Popen[str]:
     return subprocess.Popen(
         command,
         cwd=ROOT,
+        stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         preexec_fn=interruptible,  # noqa: PLW1509 - nothing else happens between fork and exec
     )
 
 
-def ended(process: subprocess.Popen[str], number: int | None = None) -> str:
-    """Return what a recorder said, after a signal or by itself; it must have ended well."""
+def results(process: subprocess.Popen[str], number: int | None = None) -> tuple[str, str]:
+    """Return what a recorder printed and said, after a signal or by itself; it must end well."""
     if number is not None:
         process.send_signal(number)
-    _, err = process.communicate(timeout=90)
+    out, err = process.communicate(timeout=90)
     assert process.returncode == 0, err
-    return err
+    return out, err
+
+
+def ended(process: subprocess.Popen[str], number: int | None = None) -> str:
+    """Return what a recorder said; see :func:`results`."""
+    return results(process, number)[1]
 
 
 def by_topic(path: Path) -> dict[str, list[LoggedMessage]]:

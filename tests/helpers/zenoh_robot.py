@@ -78,6 +78,11 @@ class Publisher:
         self.publisher.put(payload, attachment=attachment)
 
 
+def heard(*publishers: Publisher) -> bool:
+    """Return whether somebody subscribes to each of them."""
+    return all(item.publisher.matching_status.matching for item in publishers)
+
+
 def main(router: str, kind: str, width: int, height: int, fps: float, hz: float, s: float) -> None:
     peer = session("peer", connect=router)
     images = (
@@ -91,7 +96,7 @@ def main(router: str, kind: str, width: int, height: int, fps: float, hz: float,
     robot.send(messages.string(URDF))
     payloads = [image_payload(kind, width, height, number) for number in range(30)]
     end = time.monotonic() + _MATCHED_S
-    while not all(item.publisher.matching_status.matching for item in (images, states)):
+    while not heard(images, states):
         if time.monotonic() > end:
             raise SystemExit("nobody listens")
         time.sleep(0.01)

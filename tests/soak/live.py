@@ -28,7 +28,7 @@ from tests.helpers.robots import TRANSPORTS, Network, network
 from tests.helpers.ros2_robot import IMAGE, STATES
 from tooltip_cli.log import messages
 from tooltip_cli.log.container import LoggedMessage, iterate
-from tooltip_cli.rig.rigfile import rig_files
+from tooltip_cli.stages.calibrate import write_rig
 
 PATHS = ("camera", *TRANSPORTS)
 FPS, JOINT_HZ = 30, 100
@@ -65,10 +65,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name, joined(options.path) as (chosen, start):
         folder = Path(name)
         out = folder / "out.mcap"
-        for file, text in rig_files(RIG).items():
-            (folder / file).write_text(text)
         command = [sys.executable, "-m", "tooltip_cli.cli.main", "record", options.path, str(out)]
-        command += [*chosen, "--rig", str(folder / "rig.yaml"), "--reconnect"]
+        command += [*chosen, "--rig", str(write_rig(RIG, folder)), "--reconnect"]
         recorder = subprocess.Popen(command, stderr=subprocess.PIPE)
         sent, memory = Counter[str](), list[int]()
         end = time.monotonic() + 60 * options.minutes
