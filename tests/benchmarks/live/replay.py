@@ -4,14 +4,14 @@ python -m tests.benchmarks.live.replay http|udp|ros2|zenoh|ros1 ../shared/data/r
 
 ``http`` and ``udp`` go to ``record camera``, as MJPEG and as an MPEG-TS stream of ffmpeg (needed),
 with joints over a socket; the others to the command of their name. A stream that is encoded and
-decoded is late by some images, so for ``udp`` the delay is measured and entered in the rig.
+decoded is late by some images, so for ``udp`` the delay is measured and entered in the rig. What
+``estimate --refine time`` finds where some of it, or none, is entered is printed before.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import re
 import resource
 import shutil
 import socket
@@ -22,8 +22,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
 from tests.helpers.live import MjpegServer, Played, free_port, play, played, udp_joints
 from tests.helpers.recorder import by_topic
@@ -31,12 +34,13 @@ from tests.helpers.robots import Network, network
 from tooltip_cli.log import messages
 from tooltip_cli.log.container import LoggedMessage, iterate
 from tooltip_cli.log.recording import read_recording
-from tooltip_cli.rig.rigfile import load_rig, rig_files
+from tooltip_cli.rig.rigfile import load_rig
 from tooltip_cli.sources.ros1types import typestore
 from tooltip_cli.sources.streams import IMAGE_TOPIC
+from tooltip_cli.stages.calibrate import write_rig
 
 FPS = 30
-_LAST = 30  # images that the sender pushes out at its end
+_LEFT_S = (0.0, 0.03, 0.06, 0.09, 0.12)  # of the delay of a stream, for ``--refine`` to find
 
 
 def tooltip(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -44,11 +48,11 @@ def tooltip(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def tip(recording: Path, rig: Path, out: Path) -> dict[str, object]:
+def tip(recording: Path, rig: Path, out: Path, *options: str) -> dict[str, Any]:
     out.mkdir()
-    done = tooltip("estimate", recording, "--rig", rig, "--out", out, "--json")
+    done = tooltip("estimate", recording, "--rig", rig, "--out", out, "--json", *options)
     print(done.stderr.strip())
-    document: dict[str, object] = json.loads((out / f"{recording.stem}.tip.json").read_text())
+    document: dict[str, Any] = json.loads((out / f"{recording.stem}.tip.json").read_text())
     return document
 
 
@@ -64,17 +68,17 @@ def over_camera(kind: str, path: Path, rig: Path, out: Path) -> str:
     with sink() as (source, ready, show), udp_joints(port) as send:
         names = ["--camera", source, "--joints", f"udp://127.0.0.1:{port}", "--rig", rig]
         process = recorder("camera", out, *names, "--patience", 5)
-        items, shown_ns = played(path), list[int]()
+        items, shown = played(path), list[tuple[int, bytes]]()
         ready(items, out)
 
         def note_and_show(image: bytes) -> None:
-            shown_ns.append(time.time_ns())
+            shown.append((time.time_ns(), image))
             show(image)
 
         play(items, note_and_show, send)
     said = process.communicate(timeout=60)[0]
     if kind == "udp":
-        put_clocks_right(out, rig, shown_ns)
+        put_clocks_right(out, rig, shown)
     return said
 
 
@@ -156,8 +160,7 @@ def playing(
 def main(kind: str, path: Path) -> None:
     rig = path.with_name(f"{path.stem}.rig.yaml")
     folder = Path(tempfile.mkdtemp())
-    full_rig, out = folder / "rig.yaml", folder / "live.mcap"
-    with_camera(path, rig, full_rig)
+    full_rig, out = with_camera(path, rig, folder), folder / "live.mcap"
     over = over_camera if kind in ("http", "udp") else over_network
     print(over(kind, path, full_rig, out))
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -167,28 +170,54 @@ def main(kind: str, path: Path) -> None:
     live, own = tip(out, full_rig, folder / "live"), tip(copy, rig, folder / "own")
     print("live", live["status"], live.get("tip"), "\nown ", own["status"], own.get("tip"))
     if live["status"] == own["status"] == "ok":
-        points = [np.array(item["tip"]["position_m"]) for item in (live, own)]  # type: ignore[index]
+        points = [np.array(item["tip"]["position_m"]) for item in (live, own)]
         apart = 1000 * np.linalg.norm(points[0] - points[1])
         print(f"{path.name} over {kind}: {apart:.2f} mm apart")
     shutil.rmtree(folder)
 
 
-def put_clocks_right(recording: Path, rig: Path, shown_ns: Sequence[int]) -> None:
-    """Enter in the rig how late the images came, as one would who has measured a camera's delay."""
-    stamps = [m.log_time_ns for m in by_topic(recording)[IMAGE_TOPIC]]
-    # counted from the end: what came before the play began has no partner
-    pairs = list(zip(reversed(stamps), reversed(shown_ns), strict=False))[_LAST:]
-    late_s = float(np.median([arrived - shown for arrived, shown in pairs])) / 1e9
-    print(f"{len(stamps)} images, {len(shown_ns)} shown, {1000 * late_s:.0f} ms late")
-    text = rig.read_text()
-    rig.write_text(re.sub(r"(?m)^time_offset:.*$", f"time_offset: {-late_s}", text))
+def put_clocks_right(recording: Path, rig: Path, shown: Sequence[tuple[int, bytes]]) -> None:
+    """Enter in the rig how late the images came, as one would who has measured a camera's delay.
+
+    First, some of the delay is left for ``--refine time`` to find.
+    """
+    late_s = delay_s(recording, shown)
+    for left_s in (*_LEFT_S, late_s):
+        enter_offset(rig, left_s - late_s)
+        found = tip(recording, rig, rig.with_name(f"left-{left_s}"), "--refine", "time")
+        refined = found["refined"] or {"time_offset_s": 0.0, "applied": False}
+        use = "used" if refined["applied"] else "not used"
+        found_ms = -1000 * refined["time_offset_s"]
+        print(f"of {1000 * left_s:.0f} ms {found_ms:.1f} are found, {use}; {found['status']}")
+    enter_offset(rig, -late_s)
 
 
-def with_camera(recording: Path, rig: Path, out: Path) -> None:
+def delay_s(recording: Path, shown: Sequence[tuple[int, bytes]]) -> float:
+    """Return how late images came, the median, seconds; each is known by what it shows."""
+    pictures = np.array([small(image) for _, image in shown])
+    late: list[int] = []
+    for message in by_topic(recording)[IMAGE_TOPIC]:
+        picture = small(bytes(messages.decode(message.datatype, message.payload).data))
+        nearest = int(np.argmin(((pictures - picture) ** 2).sum(axis=1)))
+        if nearest > 0:  # the first one was shown before the play too
+            late.append(message.log_time_ns - shown[nearest][0])
+    print(f"{len(late)} images of {len(shown)}, {np.median(late) / 1e6:.1f} ms late")
+    return float(np.median(late)) / 1e9
+
+
+def small(image: bytes) -> npt.NDArray[np.float32]:
+    """Return the grey levels of a part of an image, whose noise tells it from its neighbours."""
+    pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_GRAYSCALE)
+    return np.asarray(pixels[::4, ::4], dtype=np.float32).ravel()
+
+
+def enter_offset(rig: Path, offset_s: float) -> None:
+    write_rig(replace(load_rig(rig), time_offset_s=offset_s), rig.parent)
+
+
+def with_camera(recording: Path, rig: Path, folder: Path) -> Path:
     """Write a rig that holds the intrinsics and the robot too, as a live camera needs it."""
-    full = replace(load_rig(rig), camera=read_recording(recording).camera)
-    for name, text in rig_files(full).items():
-        (out.parent / name).write_text(text)
+    return write_rig(replace(load_rig(rig), camera=read_recording(recording).camera), folder)
 
 
 if __name__ == "__main__":
