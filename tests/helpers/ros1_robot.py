@@ -50,8 +50,8 @@ def pacing() -> Any:
 
 def play(path: str) -> None:
     """Publish the messages of a file, which are ROS 1's; see tests.helpers.pacing."""
-    import rospy  # type: ignore[import-not-found]
-    import sensor_msgs.msg  # type: ignore[import-not-found]
+    import rospy
+    import sensor_msgs.msg
 
     rospy.init_node("robot", disable_signals=True)
 

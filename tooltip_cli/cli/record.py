@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tooltip_cli.cli.options import PATH, jobs_option, progress, say, topic_options
-from tooltip_cli.cli.record_live import camera
+from tooltip_cli.cli.record_camera import camera
 from tooltip_cli.cli.record_robot import list_, ros1, ros2, zenoh
 from tooltip_cli.cli.recording import (
     finish,

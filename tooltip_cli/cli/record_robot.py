@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from tooltip_cli.cli.options import PATH, json_option, print_json, say, table, topic_options
-from tooltip_cli.cli.record_live import live_options, record_until_end
 from tooltip_cli.cli.recording import (
+    live_options,
     load_rig_file,
     load_urdf,
     out_argument,
+    record_until_end,
     result_options,
     rig_options,
 )
@@ -226,26 +227,19 @@ def _record_robot(
     joints: str | None,
     info: str | None,
     pose: str | None,
-    duration: float | None,
-    until_enough: bool,
-    reconnect: bool,
-    patience: float,
-    queue: int,
     rig: Path | None,
     robot: Path | None,
-    min_free: int,
+    reconnect: bool,
     force: bool,
-    as_json: bool,
+    **options: Any,
 ) -> None:
     from tooltip_cli.log.recording import Topics
     from tooltip_cli.log.whole import check_absent
-    from tooltip_cli.stages.live import LiveOptions
 
     check_absent(out, overwrite=force)  # before anybody waits for topics
     topics = Topics(image, joints, info, pose)
     source = robot_source(open_bus, str(out), topics, rig, robot, wait=reconnect)
-    options = LiveOptions(duration, until_enough, reconnect, patience, queue, min_free)
-    record_until_end(source, out, options, force, as_json)
+    record_until_end(source, out, reconnect=reconnect, force=force, **options)
 
 
 def robot_source(

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from tooltip_cli.cli.options import PATH, print_json, say, size_in_bytes
+from tooltip_cli.cli.options import PATH, StatusLine, print_json, say, size_in_bytes
 
 if TYPE_CHECKING:
     from tooltip_cli.rig.rigfile import Rig
     from tooltip_cli.sources.base import SourceReport
+    from tooltip_cli.sources.live import LiveSource
+    from tooltip_cli.stages.live import Status
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -20,6 +22,52 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 def out_argument(command: _Command) -> _Command:
     """Add ``OUT.mcap``."""
     return click.argument("out", type=PATH, metavar="OUT.mcap")(command)
+
+
+patience_option = click.option(
+    "--patience",
+    type=click.FloatRange(min=0.1),
+    default=10.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="End after so long without an image.",
+)
+reconnect_option = click.option(
+    "--reconnect",
+    is_flag=True,
+    help="Wait for a source that is not there or disappears, instead of ending.",
+)
+duration_option = click.option(
+    "--duration",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="End so long after the first image. Default: at Ctrl-C.",
+)
+
+
+def live_options(command: _Command) -> _Command:
+    """Add what all live recordings have in common."""
+    for option in (
+        click.option(
+            "--queue",
+            type=size_in_bytes,
+            default="256MB",
+            show_default=True,
+            metavar="SIZE",
+            help="Memory for what is received and not yet written; what does not fit is dropped "
+            "and counted.",
+        ),
+        patience_option,
+        reconnect_option,
+        click.option(
+            "--until-enough",
+            is_flag=True,
+            help="End once the motion has shown all that an estimate looks at; needs --rig.",
+        ),
+        duration_option,
+    ):
+        command = option(command)
+    return command
 
 
 def result_options(command: _Command) -> _Command:
@@ -94,3 +142,78 @@ def finish(document: dict[str, Any], as_json: bool) -> None:
         print_json(document)
     else:
         click.echo(document["recording"])
+
+
+def record_until_end(
+    source: LiveSource,
+    out: Path,
+    *,
+    duration: float | None,
+    until_enough: bool,
+    reconnect: bool,
+    patience: float,
+    queue: int,
+    min_free: int,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Record by :func:`live_options`, with a line that says how it stands; print the result."""
+    from tooltip_cli.log.stopping import stop_on_signals
+    from tooltip_cli.stages.live import LiveOptions, record_live
+    from tooltip_cli.stages.watching import MotionObserver
+
+    if source.rig is None and until_enough:
+        raise click.UsageError("--until-enough needs --rig: without one no motion is judged")
+    observer = MotionObserver(source.rig) if source.rig is not None else None
+    line = StatusLine(str(out))
+    try:
+        with stop_on_signals() as stop:
+            report = record_live(
+                source,
+                out,
+                LiveOptions(duration, until_enough, reconnect, patience, queue, min_free),
+                stop=stop,
+                overwrite=force,
+                observer=observer,
+                on_status=lambda status: line.show(status_text(status)),
+                on_note=line.note,
+            ).report
+    finally:
+        line.clear()
+    document = tell(out, report, told=len(report.notes))
+    verdict = observer.verdict(now=True) if observer is not None else None
+    if verdict is not None:
+        say(
+            f"{out}: motion: {verdict.advice} ({verdict.frames} usable images, seen from "
+            f"directions {verdict.view_deg:.0f} degrees apart)"
+        )
+        document["motion"] = {
+            "verdict": verdict.code,
+            "frames": verdict.frames,
+            "view_deg": verdict.view_deg,
+            "turn_deg": verdict.turn_deg,
+        }
+    finish(document, as_json)
+
+
+def status_text(status: Status) -> str:
+    """Return the line: the verdict first, for it is what the person at the robot looks for."""
+    parts = []
+    verdict = status.verdict
+    if verdict is not None:
+        parts.append(verdict.advice.upper())
+        if verdict.frames or verdict.motion_px:
+            parts.append(
+                f"{verdict.frames}/{verdict.wanted_frames} images, {verdict.view_deg:.0f} deg, "
+                f"{verdict.motion_px:.1f} px/image"
+            )
+    parts.append(f"{status.elapsed_s:.0f} s")
+    for stream in status.streams:
+        if stream.expected or stream.dropped:
+            rate = "SILENT" if stream.silent else f"{stream.rate_hz:.0f} Hz"
+            lost = f" ({stream.dropped} dropped)" if stream.dropped else ""
+            parts.append(f"{stream.topic} {rate}{lost}")
+    parts.append(f"{status.size_bytes / 1e6:.0f} MB, {status.free_bytes / 1e9:.0f} GB free")
+    if status.queued_bytes > 10_000_000:
+        parts.append(f"queue {status.queued_bytes / 1e6:.0f} MB")
+    return " | ".join(parts)

@@ -19,19 +19,14 @@ from tooltip_cli.cli.options import (
     tip_sentence,
     topic_options,
 )
-from tooltip_cli.cli.record_live import (
-    camera_options,
-    camera_source,
-    duration_option,
-    patience_option,
-    reconnect_option,
-)
+from tooltip_cli.cli.record_camera import camera_options, camera_source
 from tooltip_cli.cli.record_robot import (
     domain_option,
     master_option,
     robot_source,
     zenoh_options,
 )
+from tooltip_cli.cli.recording import duration_option, patience_option, reconnect_option
 
 if TYPE_CHECKING:
     from tooltip_cli.method.voting.params import VotingSettings

@@ -208,6 +208,7 @@ def delay_s(recording: Path, shown: Sequence[tuple[int, bytes]]) -> float:
 def small(image: bytes) -> npt.NDArray[np.float32]:
     """Return the grey levels of a part of an image, whose noise tells it from its neighbours."""
     pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert pixels is not None
     return np.asarray(pixels[::4, ::4], dtype=np.float32).ravel()
 
 
