@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import itertools
 import os
 import shutil
@@ -21,7 +20,7 @@ from tests.helpers.live import MjpegServer, free_port, joint_line, udp_joints
 from tests.helpers.logs import IMAGE_TOPIC, JOINT_TOPIC, image_message, joint_message, jpeg_of
 from tests.helpers.recorder import ROOT, by_topic, ended, interruptible, recorder, wait_for
 from tests.helpers.robot import JOINTS, RIG
-from tests.helpers.robots import SYSTEM_PYTHON, has_ros1, ros1_environment
+from tests.helpers.robots import SYSTEM_PYTHON, TRANSPORTS, can_use, ros1_environment
 from tests.helpers.ros2_robot import IMAGE, STATES
 from tests.test_live_recording import Robot
 from tooltip_cli.log import messages
@@ -102,7 +101,6 @@ def ip(*arguments: str) -> None:
 
 
 ROBOT = ("jpeg", "320", "240", "30", "100", "11")
-NEEDS = {"ros2": "cyclonedds", "zenoh": "zenoh", "ros1": "rosbags"}
 
 
 @contextlib.contextmanager
@@ -142,11 +140,9 @@ def robot_over(cable: Cable, transport: str) -> Iterator[tuple[list[str], subpro
 
 
 @pytest.mark.skipif(not can_cut(), reason="needs root, and Linux' network namespaces")
-@pytest.mark.parametrize("transport", ["ros2", "zenoh", "ros1"])
+@pytest.mark.parametrize("transport", TRANSPORTS)
 def test_a_network_that_is_cut_for_five_seconds(transport: str, tmp_path: Path) -> None:
-    if importlib.util.find_spec(NEEDS[transport]) is None or (
-        transport == "ros1" and not has_ros1()
-    ):
+    if not can_use(transport):
         pytest.skip(f"what 'record {transport}' and its robot need is not installed")
     out = tmp_path / "out.mcap"
     with Cable() as cable, robot_over(cable, transport) as (options, robot):

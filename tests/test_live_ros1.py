@@ -6,11 +6,9 @@ that need them skip where they are not installed. Others speak to a master writt
 
 from __future__ import annotations
 
-import json
 import signal
 import socket
 import struct
-import subprocess
 import sys
 import threading
 import time
@@ -26,15 +24,13 @@ from tests.helpers import ros1_robot
 from tests.helpers.cli import tooltip
 from tests.helpers.live import free_port
 from tests.helpers.recorder import by_topic, ended, grown, recorder, wait_for
-from tests.helpers.robot import CAMERA_FRAME, JOINTS, URDF
+from tests.helpers.robot import URDF
 from tests.helpers.robots import (
-    SYSTEM_PYTHON,
-    Network,
     has_ros1,
-    ros1_environment,
+    network_at,
     ros1_master,
 )
-from tests.helpers.ros1_robot import DESCRIPTION, IMAGE, INFO, PICTURES, RAW, STATES
+from tests.helpers.ros1_robot import DESCRIPTION, IMAGE, INFO, STATES
 from tooltip_cli.log import messages
 from tooltip_cli.log.messages import Message, decode
 from tooltip_cli.sources import ros1types
@@ -55,56 +51,10 @@ def master() -> Iterator[str]:
         yield uri
 
 
-def robot(master: str, *arguments: object) -> subprocess.Popen[str]:
-    command = [SYSTEM_PYTHON, "tests/helpers/ros1_robot.py"]
-    return Network([], command, ros1_environment(master)).start(*arguments)
-
-
-def image_payload(kind: str, width: int, height: int, fps: float, number: int) -> bytes:
-    """Return the CDR bytes that the robot's image must have become."""
-    data = ros1_robot.picture(kind, width, height, number % PICTURES)
-    stamp_ns = ros1_robot.stamp_ns(fps, number)
-    if kind == "jpeg":
-        return messages.compressed_image(stamp_ns, CAMERA_FRAME, "jpeg", data)
-    fields = {"height": height, "width": width, "encoding": "bgr8", "step": 3 * width}
-    header = messages.header(stamp_ns, CAMERA_FRAME)
-    return messages.encode(messages.IMAGE, {"header": header, **fields, "data": data})
-
-
-@needs_ros1
-@pytest.mark.parametrize(
-    ("kind", "topic", "datatype"),
-    [("jpeg", IMAGE, messages.COMPRESSED_IMAGE), ("raw", RAW, messages.IMAGE)],
-)
-def test_every_message_arrives_as_ros2_has_it(
-    kind: str, topic: str, datatype: str, master: str, tmp_path: Path
-) -> None:
-    out = tmp_path / "out.mcap"
-    sender = robot(master, kind, 320, 240, 30, 200, 2.0)
-    names = ("--image", topic, "--joints", STATES, "--patience", 3)
-    listener = recorder("ros1", out, "--master", master, *names)
-    sent, _ = sender.communicate(timeout=90)
-    ended(listener)
-    images, joints = map(int, sent.split())
-    found = by_topic(out)
-    assert [m.payload for m in found[topic]] == [
-        image_payload(kind, 320, 240, 30, i) for i in range(images)
-    ]
-    states = [decode(messages.JOINT_STATE, m.payload) for m in found[STATES]]
-    assert [messages.ns_from_time(state.header.stamp) for state in states] == [
-        ros1_robot.stamp_ns(200, i) for i in range(joints)
-    ]
-    assert [tuple(state.position) for state in states] == [
-        ros1_robot.angles(i) for i in range(joints)
-    ]
-    assert {tuple(state.name) for state in states} == {JOINTS}
-    assert {m.datatype for m in found[topic]} == {datatype}
-
-
 @needs_ros1
 def test_topics_are_found_with_the_latched_and_the_description(master: str, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
-    sender = robot(master, "jpeg", 64, 48, 30, 100, 2.0)
+    sender = network_at("ros1", master).start("jpeg", 64, 48, 30, 100, 2.0)
     wait_for(lambda: INFO in [topic.name for topic in Ros1Bus(master).heard(0)], "the robot")
     listener = recorder("ros1", out, "--master", master, "--patience", 3)
     sender.communicate(timeout=90)
@@ -129,7 +79,7 @@ def test_a_master_that_is_not_there_yet_is_waited_for(
     time.sleep(2)  # in which nothing answers
     with ros1_master() as (master, _):
         assert master == uri
-        robot(master, "jpeg", 64, 48, 30, 100, 1.5).communicate(timeout=90)
+        network_at("ros1", master).start("jpeg", 64, 48, 30, 100, 1.5).communicate(timeout=90)
     err = ended(listener, signal.SIGINT)
     assert err.count("cannot be reached (Connection refused)") == 1
     assert "; waiting for it" in err
@@ -140,13 +90,13 @@ def test_a_master_that_is_not_there_yet_is_waited_for(
 def test_a_node_that_is_killed_and_restarted_is_heard_again(master: str, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     names = ("--image", IMAGE, "--joints", STATES, "--reconnect")
-    first = robot(master, "jpeg", 64, 48, 30, 100, 60)
+    first = network_at("ros1", master).start("jpeg", 64, 48, 30, 100, 60)
     listener = recorder("ros1", out, "--master", master, *names)
     wait_for(grown(out, 20_000), "a recording")
     first.kill()  # the master goes on naming it
     first.communicate()
     time.sleep(2)  # so that the silence is noticed
-    second = robot(master, "jpeg", 64, 48, 30, 100, 1.5)
+    second = network_at("ros1", master).start("jpeg", 64, 48, 30, 100, 1.5)
     second.communicate(timeout=90)
     err = ended(listener, signal.SIGINT)
     stamps = [
@@ -163,7 +113,7 @@ def test_a_master_that_dies_costs_nothing_that_is_connected(tmp_path: Path) -> N
     out = tmp_path / "out.mcap"
     names = ("--image", IMAGE, "--joints", STATES, "--patience", 3)
     with ros1_master() as (master, process):
-        sender = robot(master, "jpeg", 64, 48, 30, 100, 4.0)
+        sender = network_at("ros1", master).start("jpeg", 64, 48, 30, 100, 4.0)
         listener = recorder("ros1", out, "--master", master, *names)
         wait_for(grown(out, 20_000), "a recording")
         process.kill()
@@ -171,22 +121,6 @@ def test_a_master_that_dies_costs_nothing_that_is_connected(tmp_path: Path) -> N
     err = ended(listener)
     assert len(by_topic(out)[IMAGE]) == int(sent.split()[0])
     assert err.count("who is connected is recorded on") == 1
-
-
-@needs_ros1
-def test_list_shows_topics_types_and_rates(master: str, tmp_path: Path) -> None:
-    sender = robot(master, "jpeg", 64, 48, 20, 100, 4)
-    command = ("record", "list", "--on", "ros1", "--master", master, "--json")
-    done = tooltip(*command)
-    for _ in range(10):  # until the robot is up
-        if done.code == 0 and len(json.loads(done.out)) == 4:
-            break
-        done = tooltip(*command)
-    sender.communicate(timeout=90)
-    found = {item["topic"]: item for item in json.loads(done.out)}
-    assert set(found) == {IMAGE, INFO, STATES, "/rosout"}
-    assert found[STATES]["hz"] > found[IMAGE]["hz"] > 1
-    assert found["/rosout"]["hz"] is None
 
 
 def test_nobody_there_says_so(tmp_path: Path) -> None:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
-import json
 import os
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -21,67 +18,19 @@ from cyclonedds.domain import DomainParticipant
 from tests.helpers import ros2_robot
 from tests.helpers.cli import tooltip
 from tests.helpers.fastdds_robot import has_fastdds, program
-from tests.helpers.recorder import ROOT, by_topic, ended, grown, recorder, wait_for
+from tests.helpers.recorder import by_topic, ended, grown, recorder, wait_for
 from tests.helpers.robot import URDF
-from tests.helpers.ros2_robot import IMAGE, INFO, RAW, ROBOT, STATES, Publisher
+from tests.helpers.robots import LOOPBACK, network_at, on_the_wire, own_domain
+from tests.helpers.ros2_robot import IMAGE, ROBOT, STATES, Publisher
 from tooltip_cli.log import messages
 from tooltip_cli.sources.dds import dds_type_name, ros_type_name
-
-_NUMBERS = itertools.count(30)
-LOOPBACK = (
-    "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo'/></Interfaces>"
-    "<AllowMulticast>false</AllowMulticast></General><Discovery>"
-    "<ParticipantIndex>auto</ParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers>"
-    "</Discovery></Domain></CycloneDDS>"
-)
 
 
 @pytest.fixture
 def domain(worker_id: str, monkeypatch: pytest.MonkeyPatch) -> int:
     """Return a domain for one test alone, which no other one's publishers are heard in."""
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
-    worker = int(worker_id.removeprefix("gw")) if worker_id != "master" else 8
-    return 20 * (worker % 9) + next(_NUMBERS)
-
-
-def robot(domain: int, *arguments: object, kind: str = "ros2") -> subprocess.Popen[str]:
-    module = f"tests.helpers.{kind}_robot"
-    command = [sys.executable, "-m", module, str(domain), *map(str, arguments)]
-    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-
-
-def on_the_wire(payload: bytes) -> bytes:
-    """Return CDR bytes as they are sent, in whole words."""
-    return payload + bytes(-len(payload) % 4)
-
-
-@pytest.mark.parametrize(
-    ("kind", "topic", "datatype"),
-    [("jpeg", IMAGE, messages.COMPRESSED_IMAGE), ("raw", RAW, messages.IMAGE)],
-)
-def test_every_message_arrives_byte_for_byte(
-    kind: str, topic: str, datatype: str, domain: int, tmp_path: Path
-) -> None:
-    out = tmp_path / "out.mcap"
-    sender = robot(domain, kind, 320, 240, 30, 200, 2.0)
-    listener = recorder(
-        "ros2", out, "--domain", domain, "--image", topic, "--joints", STATES, "--patience", 3
-    )
-    sent, _ = sender.communicate(timeout=90)
-    ended(listener)
-    images, joints = map(int, sent.split())
-    found = by_topic(out)
-    assert [m.payload for m in found[topic]] == [
-        on_the_wire(ros2_robot.image_payload(kind, 320, 240, i % 30)) for i in range(images)
-    ]
-    assert [m.payload for m in found[STATES]] == [
-        on_the_wire(ros2_robot.joint_payload(i)) for i in range(joints)
-    ]
-    assert {m.datatype for m in found[topic]} == {datatype}
-    assert all(0 < m.publish_time_ns <= m.log_time_ns for m in found[topic])
-    if INFO in found:  # those that were heard of before the recording began
-        assert len(found[INFO]) == images
-        assert [m.payload for m in found[ROBOT]] == [on_the_wire(messages.string(URDF))]
+    return own_domain(worker_id)
 
 
 def test_topics_are_found_and_latched_ones_are_read(domain: int, tmp_path: Path) -> None:
@@ -141,33 +90,18 @@ def test_a_publisher_that_is_killed_and_restarted_is_heard_again(
     out = tmp_path / "out.mcap"
     options = ("--image", IMAGE, "--joints", STATES, "--reconnect")
     listener = recorder("ros2", out, "--domain", domain, *options)
-    first = robot(domain, "jpeg", 64, 48, 30, 100, 60)
+    first = network_at("ros2", str(domain)).start("jpeg", 64, 48, 30, 100, 60)
     wait_for(grown(out, 20_000), "a recording")
     first.kill()
     first.communicate()
     time.sleep(2)  # so that the silence is noticed
-    second = robot(domain, "jpeg", 64, 48, 30, 100, 1.5)
+    second = network_at("ros2", str(domain)).start("jpeg", 64, 48, 30, 100, 1.5)
     second.communicate(timeout=90)
     err = ended(listener, signal.SIGINT)
     payloads = [m.payload for m in by_topic(out)[IMAGE]]
     assert payloads.count(on_the_wire(ros2_robot.image_payload("jpeg", 64, 48, 0))) >= 2
     assert f"nothing on {IMAGE} any more" in err
     assert f"{IMAGE} is heard again after" in err
-
-
-def test_list_shows_topics_types_and_rates(domain: int) -> None:
-    sender = robot(domain, "jpeg", 64, 48, 20, 100, 4)
-    done = tooltip("record", "list", "--on", "ros2", "--domain", domain, "--json")
-    for _ in range(10):  # until the robot is up
-        if done.code == 0 and len(json.loads(done.out)) == 4:
-            break
-        done = tooltip("record", "list", "--on", "ros2", "--domain", domain, "--json")
-    sender.communicate(timeout=90)
-    found = {item["topic"]: item for item in json.loads(done.out)}
-    assert set(found) == {IMAGE, INFO, STATES, ROBOT}
-    assert found[IMAGE]["type"] == messages.COMPRESSED_IMAGE
-    assert found[STATES]["hz"] > found[IMAGE]["hz"] > 1
-    assert found[ROBOT]["hz"] == 0
 
 
 @pytest.mark.parametrize("command", [("ros2", "out.mcap"), ("list", "--on", "ros2")])
@@ -195,7 +129,7 @@ def test_another_vendors_dds_is_recorded_byte_for_byte(
     program()  # compiled before the time for finding each other runs
     monkeypatch.setenv("CYCLONEDDS_URI", "<CycloneDDS><Domain/></CycloneDDS>")
     domain, out = 200 + os.getpid() % 30, tmp_path / "out.mcap"
-    sender = robot(domain, "jpeg", 320, 240, 30, 200, 2.0, kind="fastdds")
+    sender = network_at("fastdds", str(domain)).start("jpeg", 320, 240, 30, 200, 2.0)
     listener = recorder("ros2", out, "--domain", domain, "--image", IMAGE, "--joints", STATES)
     sent, _ = sender.communicate(timeout=90)
     ended(listener, signal.SIGINT)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -19,13 +17,11 @@ pytest.importorskip("zenoh")
 from tests.helpers import zenoh_robot
 from tests.helpers.cli import tooltip
 from tests.helpers.live import free_port
-from tests.helpers.recorder import ROOT, by_topic, ended, grown, recorder, wait_for
+from tests.helpers.recorder import by_topic, ended, grown, recorder, wait_for
 from tests.helpers.robot import URDF
-from tests.helpers.robots import Router
+from tests.helpers.robots import Router, network_at
 from tests.helpers.ros2_robot import (
     IMAGE,
-    INFO,
-    RAW,
     ROBOT,
     STATES,
     image_payload,
@@ -61,37 +57,6 @@ def peer(router: Router) -> Iterator[Any]:
     peer.close()
 
 
-def robot(router: Router, *arguments: object) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "tests.helpers.zenoh_robot", router.address]
-    return subprocess.Popen(
-        [*command, *map(str, arguments)], cwd=ROOT, stdout=subprocess.PIPE, text=True
-    )
-
-
-@pytest.mark.parametrize(
-    ("kind", "topic", "datatype"),
-    [("jpeg", IMAGE, messages.COMPRESSED_IMAGE), ("raw", RAW, messages.IMAGE)],
-)
-def test_every_message_arrives_byte_for_byte(
-    kind: str, topic: str, datatype: str, router: Router, tmp_path: Path
-) -> None:
-    out = tmp_path / "out.mcap"
-    sender = robot(router, kind, 320, 240, 30, 200, 2.0)
-    names = ("--image", topic, "--joints", STATES)
-    listener = recorder("zenoh", out, "--router", router.address, *names, "--patience", 3)
-    sent, _ = sender.communicate(timeout=90)
-    ended(listener)
-    images, joints = map(int, sent.split())
-    found = by_topic(out)
-    assert [m.payload for m in found[topic]] == [
-        image_payload(kind, 320, 240, i % 30) for i in range(images)
-    ]
-    assert [m.payload for m in found[STATES]] == [joint_payload(i) for i in range(joints)]
-    assert {m.datatype for m in found[topic]} == {datatype}
-    # both clocks are this machine's, and the publisher's time is not simply the arrival's
-    assert all(0 < m.log_time_ns - m.publish_time_ns < 10**10 for m in found[STATES])
-
-
 def test_topics_are_found_and_latched_ones_are_read(
     router: Router, peer: Any, tmp_path: Path
 ) -> None:
@@ -117,7 +82,7 @@ def test_publisher_and_router_may_go_and_come_back(router: Router, tmp_path: Pat
     out = tmp_path / "out.mcap"
     names = ("--image", IMAGE, "--joints", STATES, "--reconnect")
     listener = recorder("zenoh", out, "--router", router.address, *names)
-    first = robot(router, "jpeg", 320, 240, 30, 100, 60)
+    first = network_at("zenoh", router.address).start("jpeg", 320, 240, 30, 100, 60)
     wait_for(grown(out, 100_000), "a recording")
     maps = Path(f"/proc/{listener.pid}/maps")
     # what is mapped of a publisher stays when that has gone
@@ -127,7 +92,7 @@ def test_publisher_and_router_may_go_and_come_back(router: Router, tmp_path: Pat
     router.stop()
     time.sleep(2)  # so that the silence is noticed
     router.start()
-    second = robot(router, "jpeg", 320, 240, 30, 100, 1.5)
+    second = network_at("zenoh", router.address).start("jpeg", 320, 240, 30, 100, 1.5)
     second.communicate(timeout=90)
     err = ended(listener, signal.SIGINT)
     payloads = [m.payload for m in by_topic(out)[IMAGE]]
@@ -150,21 +115,6 @@ def test_a_topic_of_the_wrong_type_is_named(router: Router, peer: Any, tmp_path:
         in done.error
     )
     assert not list(tmp_path.iterdir())
-
-
-def test_list_shows_topics_types_and_rates(router: Router) -> None:
-    sender = robot(router, "jpeg", 64, 48, 20, 100, 4)
-    command = ("record", "list", "--on", "zenoh", "--router", router.address, "--json")
-    done = tooltip(*command)
-    for _ in range(10):  # until the robot is up
-        if done.code == 0 and len(json.loads(done.out)) == 4:
-            break
-        done = tooltip(*command)
-    sender.communicate(timeout=90)
-    found = {item["topic"]: item for item in json.loads(done.out)}
-    assert set(found) == {IMAGE, INFO, STATES, ROBOT}
-    assert found[IMAGE]["type"] == messages.COMPRESSED_IMAGE
-    assert found[STATES]["hz"] > found[IMAGE]["hz"] > 1
 
 
 def test_what_the_network_lost_or_is_no_cdr_is_counted(router: Router, peer: Any) -> None:

@@ -10,14 +10,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
-from tests.helpers import ros1_robot, ros2_robot
+from tests.helpers import ros2_robot
 from tests.helpers.recorder import by_topic
-from tests.helpers.robot import CAMERA_FRAME
-from tests.helpers.robots import network
-from tooltip_cli.log import messages
+from tests.helpers.robots import image_of, network
 
 
 def main(transport: str, kind: str, width: str, height: str, fps: str, hz: str, s: str) -> None:
@@ -44,28 +41,6 @@ def main(transport: str, kind: str, width: str, height: str, fps: str, hz: str, 
         f"{used / float(s):.2f} of a core; memory {usage.ru_maxrss / 1024:.0f} MiB"
     )
     out.unlink()
-
-
-def image_of(
-    transport: str, kind: str, width: int, height: int, fps: float
-) -> Callable[[int], bytes]:
-    """Return what gives the CDR bytes of the image with a number."""
-    if transport != "ros1":
-        made = [ros2_robot.image_payload(kind, width, height, i) for i in range(30)]
-        padded = [data + bytes(-len(data) % 4) for data in made]  # DDS sends whole words
-        return lambda number: (padded if transport in ("ros2", "fastdds") else made)[number % 30]
-    count = ros1_robot.PICTURES
-    pictures = [ros1_robot.picture(kind, width, height, i) for i in range(count)]
-
-    def converted(number: int) -> bytes:
-        stamp_ns, data = ros1_robot.stamp_ns(fps, number), pictures[number % count]
-        if kind == "jpeg":
-            return messages.compressed_image(stamp_ns, CAMERA_FRAME, "jpeg", data)
-        fields = {"height": height, "width": width, "encoding": "bgr8", "step": 3 * width}
-        header = messages.header(stamp_ns, CAMERA_FRAME)
-        return messages.encode(messages.IMAGE, {"header": header, **fields, "data": data})
-
-    return converted
 
 
 if __name__ == "__main__":
