@@ -21,7 +21,7 @@ from tests.helpers.fastdds_robot import has_fastdds, program
 from tests.helpers.recorder import by_topic, ended, grown, recorder, wait_for
 from tests.helpers.robot import URDF
 from tests.helpers.robots import LOOPBACK, network_at, on_the_wire, own_domain
-from tests.helpers.ros2_robot import IMAGE, ROBOT, STATES, Publisher
+from tests.helpers.ros2_robot import IMAGE, ROBOT, STATES, Publisher, heard
 from tooltip_cli.log import messages
 from tooltip_cli.sources.dds import dds_type_name, ros_type_name
 
@@ -47,12 +47,11 @@ def test_topics_are_found_and_latched_ones_are_read(domain: int, tmp_path: Path)
     )
     described.send(messages.string(URDF))
     listener = recorder("ros2", tmp_path / "out.mcap", "--domain", domain)
-    for i in range(3000):
+    wait_for(lambda: heard(images, states), "a subscription to both")
+    for i in range(50):
         images.send(ros2_robot.image_payload("jpeg", 32, 24, i))
         states.send(ros2_robot.joint_payload(i))
-        time.sleep(0.01)
-        if images.writer.get_matched_subscriptions() and i % 100 == 99:
-            break
+        time.sleep(0.02)  # the other side knows of it a little later
     time.sleep(0.5)
     ended(listener, signal.SIGINT)
     found = by_topic(tmp_path / "out.mcap")

@@ -59,6 +59,11 @@ class Publisher:
         self.writer.write(sample)
 
 
+def heard(*publishers: Publisher) -> bool:
+    """Return whether somebody subscribes to each of them."""
+    return all(item.writer.get_matched_subscriptions() for item in publishers)
+
+
 def main(domain: int, kind: str, width: int, height: int, fps: float, hz: float, s: float) -> None:
     participant = DomainParticipant(domain)
     sensor = (Policy.Reliability.BestEffort, Policy.History.KeepLast(10))
@@ -79,9 +84,7 @@ def main(domain: int, kind: str, width: int, height: int, fps: float, hz: float,
     robot.send(messages.string(URDF))
     payloads = [image_payload(kind, width, height, number) for number in range(30)]
     end = time.monotonic() + MATCHED_S
-    while not (
-        images.writer.get_matched_subscriptions() and states.writer.get_matched_subscriptions()
-    ):
+    while not heard(images, states):
         if time.monotonic() > end:
             raise SystemExit("nobody listens")
         time.sleep(0.01)
