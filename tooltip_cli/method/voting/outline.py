@@ -130,9 +130,9 @@ def _at_point(
     if pointed is None or pointed.agreement(refine) < refine.min_agreement:
         return fit
     aside = fit.position - pointed.position
-    aside = aside - (aside @ pointed.axis) * pointed.axis
+    aside = aside - (aside @ fit.axis) * fit.axis  # at a corner the other axis leads outwards
     if np.linalg.norm(aside) < params.same_place:
         return max(fit, pointed, key=lambda item: item.support(refine))
-    behind = pointed.position - params.beside_depth * pointed.axis
+    behind = pointed.position - params.beside_depth * fit.axis
     beside = missing(silhouettes, behind + np.outer([0.5, 1.0], aside))
     return pointed if beside.max() > params.min_missing_beside else fit
