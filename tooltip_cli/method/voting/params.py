@@ -155,8 +155,8 @@ class OutlineParams:
     # to each side of a point, that are looked at
     point_widths: tuple[float, ...] = (0.003, 0.0045, 0.006)
     same_place: float = 0.003  # a point nearer to the end's middle than this is the end
-    beside_depth: float = 0.004  # behind a point, where the background shows beside it
-    min_missing_beside: float = 0.25  # share of the images that must show it
+    beside_depth: float = 0.003  # behind a point, where the background shows beside it
+    min_missing_beside: float = 0.12  # share of the images that must show it
     min_agreement: float = 0.5  # of frames, below which moving edges may know better
 
 
