@@ -20,7 +20,7 @@ import pytest
 from tests.helpers.cli import tooltip
 from tests.helpers.live import MjpegServer, free_port, joint_line, udp_joints
 from tests.helpers.logs import FRAME_NS, START_NS, angles, jpeg_of
-from tests.helpers.recorder import by_topic, ended, recorder, results
+from tests.helpers.recorder import by_topic, ended, recorder, results, wait_for
 from tests.helpers.robot import JOINTS, RIG
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.log.messages import decode, ns_from_time
@@ -266,28 +266,58 @@ def test_rows_that_are_added_to_a_table_are_read(tmp_path: Path) -> None:
     path.write_text("stamp,wrist\n1.0,0.1\n")
     halt = threading.Event()
     found: list[JointSample | str] = []
+    first, last = JointSample({"wrist": 0.0}, 10**9), JointSample({"wrist": 0.5}, 4 * 10**9)
 
     def read() -> None:
         for sample in joint_samples(str(path))(halt):
             found.append(sample)
-            if len(found) == 4:
+            if sample == last:
                 return
 
     reader = threading.Thread(target=read)
     reader.start()
-    with path.open("a") as file:
+    with path.open("a", buffering=1) as file:
+
+        def heard() -> bool:
+            file.write("1,0\n")
+            return bool(found)
+
+        wait_for(heard, "a reader")
         for part in ("1700000000.000000001,0.", "25\n2,", "far\n3\n4,0.5\n"):
-            time.sleep(0.3)
             file.write(part)
             file.flush()
+            time.sleep(0.1)
     reader.join(30)
     halt.set()
-    assert found == [
+    assert [sample for sample in found if sample != first] == [
         JointSample({"wrist": 0.25}, 1_700_000_000_000_000_001),
         "rows with a value that is no number",
         "rows with another number of values than the header has columns",
-        JointSample({"wrist": 0.5}, 4_000_000_000),
+        last,
     ]
+
+
+def test_a_table_that_is_emptied_ends_its_joints(tmp_path: Path) -> None:
+    path, halt, heard = tmp_path / "joints.csv", threading.Event(), threading.Event()
+    path.write_text("stamp,wrist\n")
+    samples = joint_samples(str(path))(halt)
+
+    def write() -> None:
+        with path.open("a", buffering=1) as file:
+            while not heard.wait(0.01):
+                file.write("1.0,0.1\n")
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    assert next(samples) == JointSample({"wrist": 0.1}, 10**9)
+    heard.set()
+    writer.join()
+    path.write_text("stamp,wrist\n")
+    late = threading.Timer(30, halt.set)
+    late.start()
+    with pytest.raises(TooltipError, match="was replaced by another file"):
+        list(samples)
+    late.cancel()
 
 
 def test_lines_over_tcp_may_come_in_pieces() -> None:

@@ -225,9 +225,8 @@ def _lines_added(path: Path, file: IO[str], halt: threading.Event) -> Iterator[s
     while not halt.is_set():
         part = file.read(_MAX_LINE)
         if not part:
-            if path.stat().st_size < os.fstat(file.fileno()).st_size or (
-                path.stat().st_ino != os.fstat(file.fileno()).st_ino
-            ):
+            here, read = os.fstat(file.fileno()), os.lseek(file.fileno(), 0, os.SEEK_CUR)
+            if path.stat().st_ino != here.st_ino or here.st_size < read:
                 raise TooltipError(f"{path}: was replaced by another file")
             halt.wait(_TAIL_S)
             continue
