@@ -63,8 +63,9 @@ def _zenoh() -> Any:
 def _heard_by(take: Callable[[Any], None], declare: Callable[[Any], Any]) -> Iterator[None]:
     """Let ``take`` have every sample, in a thread of Zenoh's; that has ended when this is left.
 
-    Zenoh (1.9 or newer tells when it leaves) does not wait for it. It is a daemon where a daemon declared the subscriber, and if it is
-    still on its way out when the interpreter ends, the process aborts.
+    Zenoh, which tells when it leaves from 1.9 on, does not wait for it. It is a daemon where a
+    daemon declared the subscriber, and if it is still on its way out when the interpreter ends,
+    the process aborts.
 
     Args:
         take: called with samples.
