@@ -21,7 +21,6 @@ from tooltip_cli.method.voting.silhouette import (
     silhouette,
 )
 from tooltip_cli.rig.camera import CameraModel
-from tooltip_cli.stages.clock import laps
 
 Map = npt.NDArray[np.float32]
 
@@ -67,18 +66,6 @@ class Scene:
             turn = self._turn(views.root_from_camera[index], self._reference)
             samples[row] = _channels(image if turn is None else _looked_up(image, turn))
         self._backdrop = learn_backdrop(samples, params)
-
-    def silhouettes(self, frames: Indices) -> Iterator[FrameSilhouette]:
-        """Yield what stands before the scene in images, by their indices.
-
-        Raises:
-            TooltipError: an image cannot be decoded.
-        """
-        lap = laps()
-        for index, image in zip(frames, self._pictures.images(frames), strict=True):
-            lap("decode")
-            yield self.silhouette(image, self._views.root_from_camera[index])
-            lap("silhouettes")
 
     def silhouette(
         self, image: Image, root_from_camera: npt.NDArray[np.float64]
