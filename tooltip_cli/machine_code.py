@@ -14,7 +14,6 @@ import ctypes
 import functools
 import hashlib
 import importlib
-import importlib.metadata
 import importlib.util
 import logging
 import os
@@ -163,10 +162,7 @@ def _kernel(
 def _key(module: str, name: str, signature: str, constants: tuple[int, ...]) -> str:
     import llvmlite.binding as llvm
 
-    try:
-        version = importlib.metadata.version("numba")
-    except importlib.metadata.PackageNotFoundError as error:
-        raise ImportError("numba cannot be imported (it is not installed)") from error
+    version = _version_of_numba()
     spec = importlib.util.find_spec(module)
     assert spec is not None  # noqa: S101  (the callers name modules of this package)
     sha = hashlib.sha256()
@@ -176,6 +172,22 @@ def _key(module: str, name: str, signature: str, constants: tuple[int, ...]) -> 
     versions = (version, llvm.llvm_version_info)
     sha.update(repr((name, signature, constants, versions, host)).encode())
     return sha.hexdigest()
+
+
+def _version_of_numba() -> str:
+    """Return the version that is installed, as its folder says where it can.
+
+    Importing what looks it up by the book takes as long as detecting in ten images.
+    """
+    spec = importlib.util.find_spec("numba")
+    if spec is None or spec.origin is None:
+        raise ImportError("numba cannot be imported (it is not installed)")
+    found = list(Path(spec.origin).parents[1].glob("numba-*.dist-info"))
+    if len(found) == 1:
+        return found[0].stem.removeprefix("numba-")
+    from importlib.metadata import version
+
+    return version("numba")
 
 
 def _folders() -> list[Path]:
