@@ -74,8 +74,8 @@ def fast_or_slow(
 @functools.cache
 def _say_slow(obstacle: str) -> None:
     _LOGGER.warning(
-        "%s: detection falls back to plain numpy, which gives the same answers about a "
-        "hundred times slower",
+        "%s: detection and estimation fall back to plain numpy, which gives the same answers up to "
+        "a hundred times slower",
         obstacle,
     )
 
