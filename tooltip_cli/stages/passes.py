@@ -9,7 +9,8 @@ from tooltip_cli.log.recording import LoggedImage, Recording
 from tooltip_cli.stages.clock import Lap, laps
 from tooltip_cli.stages.threads import in_order
 
-_IMAGES_A_TASK = 32
+_IMAGES_A_PART = 32
+_ALONE = 128  # the same where threads need not be kept busy: fewer images are shown twice
 
 _Result = TypeVar("_Result")
 _Taken = TypeVar("_Taken", covariant=True)
@@ -50,9 +51,10 @@ def look_through(recording: Recording, jobs: Sequence[Job[_Result]], threads: in
         TooltipError: an image cannot be decoded.
     """
     count = len(recording.image_stamps_ns)
+    size = _IMAGES_A_PART if threads > 1 else _ALONE
 
     def work(start: int) -> list[list[_Result]]:
-        parts = [job.part(start, min(start + _IMAGES_A_TASK, count)) for job in jobs]
+        parts = [job.part(start, min(start + size, count)) for job in jobs]
         wanted = sorted(set().union(*(part.wanted for part in parts)))
         lap = laps()
         for index, image in zip(wanted, recording.logged_images(wanted), strict=True):
@@ -61,6 +63,6 @@ def look_through(recording: Recording, jobs: Sequence[Job[_Result]], threads: in
                     part.take(index, image, lap)
         return [[part.result() for part in parts]]
 
-    for results in in_order(work, range(0, count, _IMAGES_A_TASK), threads):
+    for results in in_order(work, range(0, count, size), threads):
         for job, result in zip(jobs, results, strict=True):
             job.add(result)
