@@ -9,8 +9,8 @@ from tooltip_cli.log.recording import LoggedImage, Recording
 from tooltip_cli.stages.clock import Lap, laps
 from tooltip_cli.stages.threads import in_order
 
-_IMAGES_A_PART = 32
-_ALONE = 128  # the same where threads need not be kept busy: fewer images are shown twice
+_FEWEST, _MOST = 16, 128  # images of a part
+_PARTS_A_THREAD = 4  # at least, so that none is idle for long at the end
 
 _Result = TypeVar("_Result")
 _Taken = TypeVar("_Taken", covariant=True)
@@ -51,7 +51,8 @@ def look_through(recording: Recording, jobs: Sequence[Job[_Result]], threads: in
         TooltipError: an image cannot be decoded.
     """
     count = len(recording.image_stamps_ns)
-    size = _IMAGES_A_PART if threads > 1 else _ALONE
+    fair = _MOST if threads == 1 else count // (_PARTS_A_THREAD * threads)
+    size = min(max(fair, _FEWEST), _MOST)
 
     def work(start: int) -> list[list[_Result]]:
         parts = [job.part(start, min(start + size, count)) for job in jobs]
