@@ -56,7 +56,7 @@ from tooltip_cli.stages.moving import DetectedEdges
 from tooltip_cli.stages.voting import vote
 
 SUFFIX = ".tip.json"
-VERSION = 3
+VERSION = 4
 _LOGGER = logging.getLogger(__name__)
 
 
