@@ -9,7 +9,7 @@ from tooltip_cli.log.recording import LoggedImage, Recording
 from tooltip_cli.stages.clock import Lap, laps
 from tooltip_cli.stages.threads import in_order
 
-_FEWEST, _MOST = 16, 128  # images of a part
+_FEWEST, _MOST = 16, 64  # images of a part
 _PARTS_A_THREAD = 4  # at least, so that none is idle for long at the end
 
 _Result = TypeVar("_Result")
