@@ -16,6 +16,7 @@ from tests.helpers.cli import Outcome, tooltip
 from tooltip_cli.labels.files import read_labels
 from tooltip_cli.log.container import LoggedAttachment, iterate
 from tooltip_cli.log.edges import read_edges
+from tooltip_cli.log.images import Image, decode_compressed
 from tooltip_cli.log.recording import Topics, read_recording
 from tooltip_cli.log.views import resolve_rig, resolve_views
 from tooltip_cli.method.rays import sphere_array
@@ -292,3 +293,38 @@ def test_the_cloud_shows_the_tool_up_to_its_tip(run: Run, tmp_path: Path) -> Non
     again = tooltip("export", run.recording, "--cloud", path)
     assert again.code == 1
     assert "--force" in again.err
+
+
+def stored(folder: Path) -> dict[str, list[tuple[str, int, bytes]]]:
+    """Return the messages of all artifacts in a folder, without where they come from."""
+    return {
+        path.name: [
+            (item.topic, item.log_time_ns, bytes(item.payload))
+            for item in iterate(path)
+            if not isinstance(item, LoggedAttachment)
+        ]
+        for path in sorted(folder.glob("*.mcap"))
+    }
+
+
+def test_one_pass_finds_what_two_find_and_decodes_hardly_any_image_twice(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded: list[tuple[str, bool]] = []
+
+    def counted(message: Any, gray: bool, source: str) -> Image:
+        decoded.append((source, gray))
+        return decode_compressed(message, gray, source)
+
+    monkeypatch.setattr("tooltip_cli.log.recording.decode_compressed", counted)
+    detect = ("detect", run.recording, "--force", "--out")
+    assert tooltip(*detect, tmp_path / "together").code == 0
+    looked_at_first = 1 + 2 * 8  # for the size, and for the noise
+    again = sum(gray for _, gray in decoded) - looked_at_first - 100
+    assert 1 <= again <= 31  # at the border of two parts: a pair's image, and some partners
+    assert tooltip(*detect, tmp_path / "threads", "--jobs", 3).code == 0
+    assert tooltip(*detect, tmp_path / "apart", "--preset", "paper").code == 0
+    edges_alone = stored(run.recording.parent)["small.edges.mcap"]  # by the estimate
+    together = stored(tmp_path / "together")
+    assert together == {**stored(tmp_path / "apart"), "small.edges.mcap": edges_alone}
+    assert together == stored(tmp_path / "threads")

@@ -80,7 +80,7 @@ class Case:
         pairing, _ = pair_views(self.views, settings, allowed)
         if len(pairing.frames) < settings.trust.min_frames:
             return None
-        found = find_moving_edges(self.recording, self.views, pairing, settings, 2, lambda: None)
+        found = find_moving_edges(self.recording, self.views, pairing, settings, 2)
         if same:
             self._default = found
         return found
