@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +107,28 @@ def test_arrays_of_another_kind_are_refused(module: str) -> None:
     for wrong in (values.astype(np.float32), values[::2], np.arange(4)):
         with pytest.raises(ctypes.ArgumentError):
             double(wrong, 2)
+
+
+def test_arrays_that_are_kept_or_only_read_are_taken(module: str) -> None:
+    double = machine_code.kernel(module, "doubler", "f64* i64", 3)
+    kept = machine_code.Kept(np.arange(4.0))
+    assert double(kept, 4) == 4
+    np.testing.assert_array_equal(kept.array, [0, 3, 6, 9])
+    kept.array.flags.writeable = False
+    assert double(kept.array, 0) == 0
+
+
+def test_every_thread_has_its_own_scratch_space() -> None:
+    scratch = machine_code.Scratch()
+
+    def address(key: str) -> int | None:
+        (space,) = scratch(key, lambda: (np.empty(100),))
+        return space.address.value
+
+    assert address("a") == address("a")
+    assert address("a") != address("b")
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(address, "a").result() != address("a")
 
 
 def test_constants_are_part_of_the_key(module: str) -> None:

@@ -9,19 +9,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from tests.helpers.cli import Outcome, tooltip
 from tooltip_cli.labels.files import read_labels
 from tooltip_cli.log.container import LoggedAttachment, iterate
 from tooltip_cli.log.edges import read_edges
+from tooltip_cli.log.images import Image, decode_compressed
 from tooltip_cli.log.recording import Topics, read_recording
 from tooltip_cli.log.views import resolve_rig, resolve_views
+from tooltip_cli.method.rays import sphere_array
+from tooltip_cli.method.voting.estimate import estimate_by_voting
 from tooltip_cli.method.voting.moving import MovingEdges
-from tooltip_cli.method.voting.params import VotingSettings
+from tooltip_cli.method.voting.params import TrustParams, VotingSettings
+from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.rig.rigfile import load_rig
 from tooltip_cli.stages.calibrate import write_rig
-from tooltip_cli.stages.voting import pair_views
+from tooltip_cli.stages.voting import hand_edges, pair_views
 
 
 def simulate(path: Path, frames: int, size: str, motion: str = "sweep") -> Path:
@@ -156,6 +161,41 @@ def test_damaged_edges_are_made_anew_by_one_thread_and_are_the_same(run: Run) ->
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name), name)
 
 
+def shuffled(edges: MovingEdges, seed: int) -> MovingEdges:
+    """Return the same edges and outlines, those of each frame in another order."""
+    rng = np.random.default_rng(seed)
+    silhouettes = edges.silhouettes
+    assert silhouettes is not None
+    edge = np.lexsort((rng.random(len(edges.pixels)), edges.frame_of_edge))
+    point = np.lexsort((rng.random(len(silhouettes.contours)), silhouettes.row_of_point))
+    return replace(
+        edges,
+        pixels=edges.pixels[edge],
+        translations=edges.translations[edge],
+        covariances=edges.covariances[edge],
+        silhouettes=replace(silhouettes, contours=silhouettes.contours[point]),
+    )
+
+
+def test_neither_seed_nor_order_moves_the_tip(first: Run) -> None:
+    recording = read_recording(first.recording, Topics())
+    views = resolve_views(recording, resolve_rig(recording, None))
+    camera = inverse_transform(views.hand_from_camera)
+    spheres = sphere_array([(item.center, item.radius) for item in views.spheres])
+    edges, settings = stored_edges(first), VotingSettings()
+
+    def pixels(moving: MovingEdges, seed: int) -> npt.NDArray[np.float64]:
+        used = replace(settings, trust=TrustParams(seed=seed))
+        found = estimate_by_voting(hand_edges(views, moving, camera, used), spheres, used)
+        assert found.position is not None
+        seen = camera[:, :3, :3] @ found.position + camera[:, :3, 3]
+        return np.asarray(views.camera.project(seen))
+
+    before = pixels(edges, 0)
+    for after in (pixels(edges, 1), pixels(shuffled(edges, 0), 0), pixels(shuffled(edges, 1), 2)):
+        assert np.nanmax(np.linalg.norm(after - before, axis=1)) < 0.1
+
+
 def test_other_labels_are_other_edges(run: Run) -> None:
     """Labels of other images: neither the edges nor the estimate of before is reused."""
     path = run.recording.with_name("small.labels.csv")
@@ -253,3 +293,38 @@ def test_the_cloud_shows_the_tool_up_to_its_tip(run: Run, tmp_path: Path) -> Non
     again = tooltip("export", run.recording, "--cloud", path)
     assert again.code == 1
     assert "--force" in again.err
+
+
+def stored(folder: Path) -> dict[str, list[tuple[str, int, bytes]]]:
+    """Return the messages of all artifacts in a folder, without where they come from."""
+    return {
+        path.name: [
+            (item.topic, item.log_time_ns, bytes(item.payload))
+            for item in iterate(path)
+            if not isinstance(item, LoggedAttachment)
+        ]
+        for path in sorted(folder.glob("*.mcap"))
+    }
+
+
+def test_one_pass_finds_what_two_find_and_decodes_hardly_any_image_twice(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoded: list[tuple[str, bool]] = []
+
+    def counted(message: Any, gray: bool, source: str) -> Image:
+        decoded.append((source, gray))
+        return decode_compressed(message, gray, source)
+
+    monkeypatch.setattr("tooltip_cli.log.recording.decode_compressed", counted)
+    detect = ("detect", run.recording, "--force", "--out")
+    assert tooltip(*detect, tmp_path / "together").code == 0
+    looked_at_first = 1 + 2 * 8  # for the size, and for the noise
+    again = sum(gray for _, gray in decoded) - looked_at_first - 100
+    assert 1 <= again <= 31  # at the border of two parts: a pair's image, and some partners
+    assert tooltip(*detect, tmp_path / "threads", "--jobs", 3).code == 0
+    assert tooltip(*detect, tmp_path / "apart", "--preset", "paper").code == 0
+    edges_alone = stored(run.recording.parent)["small.edges.mcap"]  # by the estimate
+    together = stored(tmp_path / "together")
+    assert together == {**stored(tmp_path / "apart"), "small.edges.mcap": edges_alone}
+    assert together == stored(tmp_path / "threads")

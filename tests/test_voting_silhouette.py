@@ -11,12 +11,14 @@ import pytest
 
 from tooltip_cli.method.voting.params import SilhouetteParams
 from tooltip_cli.method.voting.silhouette import (
+    _BLUR_PX,
     BACKGROUND,
     FOREGROUND,
     NOTHING_KNOWN,
     UNKNOWN,
     Backdrop,
     FrameSilhouette,
+    _blurred,
     join_silhouettes,
     learn_backdrop,
     silhouette,
@@ -143,6 +145,12 @@ def test_a_wide_image_has_a_small_mask_that_loses_nothing() -> None:
     assert found.scale == 3
     assert found.mask.shape == (66, 333)
     assert (found.mask[17:29, 133] == FOREGROUND).all()
+
+
+def test_images_are_blurred_as_by_all_weights() -> None:
+    """The weights that are left out are 0."""
+    image = np.random.default_rng(2).integers(0, 256, (60, 81, 3), np.uint8)
+    np.testing.assert_array_equal(_blurred(image), cv2.GaussianBlur(image, (0, 0), _BLUR_PX))
 
 
 def test_silhouettes_are_joined_and_chosen_from() -> None:

@@ -14,7 +14,6 @@ import ctypes
 import functools
 import hashlib
 import importlib
-import importlib.metadata
 import importlib.util
 import logging
 import os
@@ -39,6 +38,7 @@ _TYPES = {
     "f32": "float32",
     "f64": "float64",
 }
+_BEGINNING = ctypes.c_char * 0  # of an array
 _SCALARS = {"i64": ctypes.c_int64, "f64": ctypes.c_double}
 
 # What a kernel must not call: symbols that exist only where numba has been imported.
@@ -74,10 +74,36 @@ def fast_or_slow(
 @functools.cache
 def _say_slow(obstacle: str) -> None:
     _LOGGER.warning(
-        "%s: detection falls back to plain numpy, which gives the same answers about a "
-        "hundred times slower",
+        "%s: detection and estimation fall back to plain numpy, which gives the same answers up to "
+        "a hundred times slower",
         obstacle,
     )
+
+
+class Kept:
+    """An array that many calls of a kernel take, whose address is found once.
+
+    Finding it takes longer than matching ten edges. Nobody checks its type when it is given.
+    """
+
+    def __init__(self, array: np.ndarray[Any, Any]) -> None:
+        self.array, self.address = array, ctypes.c_void_p(array.ctypes.data)
+
+
+class Scratch(threading.local):
+    """Scratch space that every thread keeps for its next call of a kernel."""
+
+    def __init__(self) -> None:
+        self._kept: dict[object, tuple[Kept, ...]] = {}
+
+    def __call__(
+        self, key: object, make: Callable[[], tuple[np.ndarray[Any, Any], ...]]
+    ) -> tuple[Kept, ...]:
+        """Return what ``make`` returned when this thread first asked for ``key``."""
+        kept = self._kept.get(key)
+        if kept is None:
+            kept = self._kept[key] = tuple(map(Kept, make()))
+        return kept
 
 
 @functools.cache
@@ -103,7 +129,7 @@ def kernel(module: str, name: str, signature: str, *constants: int) -> Callable[
             function to compile, which returns an integer.
         signature: its arguments' types, separated by blanks: u8, u16, i32, i64, f64, with ``*`` for
             the address of an array. Arrays are given as numpy arrays, C-contiguous and of that
-            type, and are checked when the kernel is called.
+            type, and are checked when the kernel is called; or as `Kept`.
 
     Raises:
         ImportError: there is no such code yet and numba cannot be imported, or it is switched off.
@@ -136,10 +162,7 @@ def _kernel(
 def _key(module: str, name: str, signature: str, constants: tuple[int, ...]) -> str:
     import llvmlite.binding as llvm
 
-    try:
-        version = importlib.metadata.version("numba")
-    except importlib.metadata.PackageNotFoundError as error:
-        raise ImportError("numba cannot be imported (it is not installed)") from error
+    version = _version_of_numba()
     spec = importlib.util.find_spec(module)
     assert spec is not None  # noqa: S101  (the callers name modules of this package)
     sha = hashlib.sha256()
@@ -149,6 +172,22 @@ def _key(module: str, name: str, signature: str, constants: tuple[int, ...]) -> 
     versions = (version, llvm.llvm_version_info)
     sha.update(repr((name, signature, constants, versions, host)).encode())
     return sha.hexdigest()
+
+
+def _version_of_numba() -> str:
+    """Return the version that is installed, as its folder says where it can.
+
+    Importing what looks it up by the book takes as long as detecting in ten images.
+    """
+    spec = importlib.util.find_spec("numba")
+    if spec is None or spec.origin is None:
+        raise ImportError("numba cannot be imported (it is not installed)")
+    found = list(Path(spec.origin).parents[1].glob("numba-*.dist-info"))
+    if len(found) == 1:
+        return found[0].stem.removeprefix("numba-")
+    from importlib.metadata import version
+
+    return version("numba")
 
 
 def _folders() -> list[Path]:
@@ -246,11 +285,18 @@ def _callable(signature: str, address: int) -> Callable[..., int]:
 def _address(kind: np.dtype[Any]) -> Any:
     """Return what ctypes makes an address of an array with; numpy's own takes ten times as long."""
 
+    start = _BEGINNING.from_buffer
+
     class Address:
         @staticmethod
-        def from_param(array: np.ndarray[Any, Any]) -> ctypes.c_void_p:
-            if array.dtype != kind or not array.flags.c_contiguous:
+        def from_param(array: Any) -> Any:  # an ndarray, or Kept
+            if array.__class__ is Kept:
+                return array.address
+            flags = array.flags
+            if array.dtype != kind or not flags.c_contiguous:
                 raise TypeError(f"expected a contiguous array of {kind}, not {array.dtype}")
+            if flags.writeable:
+                return start(array)  # a quarter of the time of the other way
             return ctypes.c_void_p(array.ctypes.data)
 
     return Address

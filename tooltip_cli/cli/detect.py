@@ -26,6 +26,8 @@ from tooltip_cli.cli.options import (
 
 if TYPE_CHECKING:
     from tooltip_cli.log.recording import Recording, Topics
+    from tooltip_cli.method.types import Reason
+    from tooltip_cli.stages.moving import DetectedEdges, PendingEdges
 
 
 @click.command()
@@ -103,12 +105,16 @@ def _detect_one(
     from tooltip_cli.log.recording import read_recording
     from tooltip_cli.stages.clock import laps
     from tooltip_cli.stages.detect import detect_in
+    from tooltip_cli.stages.moving import PendingEdges
 
     lap = laps()
     recording = read_recording(path, topics)
     lap("read")
+    has_rig = rig is not None or "rig.yaml" in recording.attachments
+    edges = _edges(recording, rig, out, force) if preset == "voting" and has_rig else None
+    along = [edges.job] if isinstance(edges, PendingEdges) else []
     with progress(len(recording.image_stamps_ns) - 1, f"detect {path.name}") as advance:
-        found = detect_in(recording, out=out, force=force, jobs=jobs, on_pair=advance)
+        found = detect_in(recording, out=out, force=force, jobs=jobs, on_pair=advance, along=along)
     for note in recording.notes:
         say(f"{path}: {note}")
     detections = found.detections
@@ -125,32 +131,39 @@ def _detect_one(
         "detections": valid,
         "flags": flags,
     }
-    if preset == "voting":
-        if rig is None and "rig.yaml" not in recording.attachments:
-            say(f"{path}: no rig is stored or given, so only consecutive images are compared")
-        else:
-            result["edges_file"] = _detect_edges(recording, rig, out, force, jobs)
+    if edges is not None:
+        result["edges_file"] = _finished(path, edges, jobs)
+    elif preset == "voting":
+        say(f"{path}: no rig is stored or given, so only consecutive images are compared")
     return result
 
 
-def _detect_edges(
-    recording: Recording, rig: Path | None, out: Path | None, force: bool, jobs: int
-) -> str | None:
-    """Find the moving edges; returns their file, or None where the motion shows nothing."""
+def _edges(
+    recording: Recording, rig: Path | None, out: Path | None, force: bool
+) -> DetectedEdges | PendingEdges | Reason:
+    """Return the moving edges, what will find them, or why the motion shows nothing."""
     from tooltip_cli.log.views import resolve_rig, resolve_views
-    from tooltip_cli.method.types import Reason
     from tooltip_cli.method.voting.params import VotingSettings
-    from tooltip_cli.stages.voting import detect_for_voting
+    from tooltip_cli.stages.clock import laps
+    from tooltip_cli.stages.voting import edges_for_voting
 
-    path = recording.path
+    lap = laps()
     views = resolve_views(recording, resolve_rig(recording, rig))
-    with progress(None, f"moving edges {path.name}, frames") as advance:
-        found = detect_for_voting(
-            recording, views, VotingSettings(), out=out, force=force, jobs=jobs, on_frame=advance
-        )
-    if isinstance(found, Reason):
-        say(f"{path}: no moving edges: {found.code}: {found.text}")
+    lap("poses")
+    return edges_for_voting(recording, views, VotingSettings(), out=out, force=force)
+
+
+def _finished(path: Path, edges: DetectedEdges | PendingEdges | Reason, jobs: int) -> str | None:
+    """Write moving edges that are not stored; returns their file, or None where there are none."""
+    from tooltip_cli.method.types import Reason
+    from tooltip_cli.stages.moving import PendingEdges
+
+    if isinstance(edges, Reason):
+        say(f"{path}: no moving edges: {edges.code}: {edges.text}")
         return None
-    how = "reused" if found.reused else "computed"
-    say(f"{path}: {how} moving edges of {len(found.edges.frames)} frames in {found.path}")
-    return str(found.path)
+    if isinstance(edges, PendingEdges):
+        with progress(None, f"moving edges {path.name}, frames") as advance:
+            edges = edges.finish(jobs, advance)
+    how = "reused" if edges.reused else "computed"
+    say(f"{path}: {how} moving edges of {len(edges.edges.frames)} frames in {edges.path}")
+    return str(edges.path)

@@ -6,7 +6,7 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeVar
 
@@ -89,19 +89,19 @@ class Recording:
         Raises:
             TooltipError: an image that cannot be decoded, or of another size than the first.
         """
+        for image in self.logged_images(indices):
+            yield image.decode(gray=gray)
+
+    def logged_images(self, indices: Iterable[int]) -> Iterator[LoggedImage]:
+        """Yield images by index, to be decoded by whoever gets them; otherwise as `images`.
+
+        Raises:
+            TooltipError: a message that is not what its topic says.
+        """
         chosen = list(indices)
-        decode = decode_raw if self.image_type == messages.IMAGE else decode_compressed
-        size: tuple[int, int] | None = None
+        sizes: set[tuple[int, int]] = set()
         for index, message in zip(chosen, self.image_messages(chosen), strict=True):
-            image = decode(message, gray, f"{self.path}: image {index}")
-            height, width = image.shape[:2]
-            if size not in (None, (width, height)):
-                raise TooltipError(
-                    f"{self.path}: the image size changes to {width}x{height} at image {index}; "
-                    "record each resolution on its own"
-                )
-            size = (width, height)
-            yield image
+            yield LoggedImage(self, index, message, sizes)
 
     def image_messages(self, indices: Iterable[int]) -> Iterator[Any]:
         """Yield the messages of images as logged, CompressedImage or Image by ``image_type``.
@@ -114,6 +114,47 @@ class Recording:
             for index in indices:
                 payload = _payload(file, self._places[index], cache, self.path)
                 yield decode_foreign(self.image_type, payload, f"{self.path}: image {index}")
+
+
+class LoggedImage:
+    """An image of a recording.
+
+    Args:
+        sizes: of those decoded before, which must be the same.
+    """
+
+    def __init__(
+        self, recording: Recording, index: int, message: Any, sizes: set[tuple[int, int]]
+    ) -> None:
+        self._recording, self._index, self._message = recording, index, message
+        self._sizes = sizes
+
+    @cached_property
+    def gray(self) -> Image:
+        """(H, W) grey levels, decoded once.
+
+        Raises:
+            TooltipError: it cannot be decoded, or has another size than those before.
+        """
+        return self.decode(gray=True)
+
+    def decode(self, *, gray: bool) -> Image:
+        """Return (H, W, 3) BGR or (H, W) gray, uint8.
+
+        Raises:
+            TooltipError: it cannot be decoded, or has another size than those before.
+        """
+        path, raw = self._recording.path, self._recording.image_type == messages.IMAGE
+        decode = decode_raw if raw else decode_compressed
+        image = decode(self._message, gray, f"{path}: image {self._index}")
+        height, width = image.shape[:2]
+        self._sizes.add((width, height))
+        if len(self._sizes) > 1:
+            raise TooltipError(
+                f"{path}: the image size changes to {width}x{height} at image {self._index}; "
+                "record each resolution on its own"
+            )
+        return image
 
 
 def _payload(

@@ -18,7 +18,8 @@ _F = np.float32
 _ZERO, _ONE, _TWO = _F(0), _F(1), _F(2)
 _TAN_22 = _F(13573)  # tan(22.5 deg) 2^15, rounded, as in OpenCV
 _SCALE = _F(1 << 15)
-_STRONG = 0x0202020202020202  # a bit of every strong point among eight
+_STRONG = np.int64(0x0202020202020202)  # a bit of every strong point among eight
+_POINT, _LAST = np.int64(8), np.int64(56)  # bits to the next point of a word, and to its last
 
 
 def _gradients(
@@ -82,6 +83,13 @@ def _suppress(
         map_[at + u] = np.uint8(weak + weak if m > high else weak)
 
 
+def _first_point(chosen: Any) -> Any:
+    """Return which of a word's eight points its lowest bit belongs to; there is one."""
+    lowest = np.float64(chosen & -chosen)  # a power of two, which a double holds
+    return ((lowest.view(np.int64) >> 52) - 1023) >> 3
+
+
+_first_point = numba.njit(forceinline=True, error_model="numpy")(_first_point)
 _gradients_of = numba.njit(forceinline=True, error_model="numpy")(_gradients)
 _suppressed = numba.njit(forceinline=True, error_model="numpy")(_suppress)
 
@@ -91,9 +99,10 @@ def edge_finder() -> Callable[..., int]:
 
     Its arguments are the image, its rows and columns, both thresholds, the margin to leave out of
     the result; scratch space: 3 rows of 3 parts of zeros, a map of zeros with a border of one
-    point, the same as words of eight points, and a stack, with room for all points and eight more;
-    and the u, v to fill, with room for all points within the margin and eight more. Parts and the
-    map's rows are as many whole words long as hold W + 2 points. An image has at least 3 rows and
+    point and eight points more, the same as words of eight points, and a queue, with room for all
+    points and eight more; and the u, v to fill, with room for all points within the margin and
+    eight more. Parts and the map's rows are as many whole words long as hold W + 2 points. Words
+    have their first point in their lowest byte. An image has at least 3 rows and
     columns. It returns how many points there are.
     """
 
@@ -107,7 +116,7 @@ def edge_finder() -> Callable[..., int]:
         ring: Any,
         map_: Any,
         words: Any,
-        stack: Any,
+        queue: Any,
         points: Any,
     ) -> int:
         stride = (width + 9) & ~7
@@ -122,28 +131,38 @@ def edge_finder() -> Callable[..., int]:
             if v > 0:
                 up, row, down = (v + 1) % 3 * size, (v + 2) % 3 * size, v % 3 * size
                 _suppressed(up, row, down, ring, stride, width, _F(low), _F(high), map_, v * stride)
-        top = np.int64(0)
-        for at in range(stride, (height + 1) * stride):
-            stack[top] = at  # written always and counted if it is one: there is no branch to guess
-            top += map_[at] == 2
-        while top > 0:
-            top -= 1
-            at = np.int64(stack[top])
+        last, across = np.int64(0), stride // 8
+        for word in range(across, (height + 1) * across):
+            near = words[word - across] | words[word] | words[word + across]
+            left = words[word - across - 1] | words[word - 1] | words[word + across - 1]
+            right = words[word - across + 1] | words[word + 1] | words[word + across + 1]
+            near |= near << _POINT | near >> _POINT | left >> _LAST | right << _LAST
+            # only a strong point with a weak one beside it has anybody to make strong
+            chosen = words[word] & (near << 1) & _STRONG
+            while chosen:
+                queue[last] = 8 * word + _first_point(chosen)
+                last += 1
+                chosen &= chosen - 1
+        done = np.int64(0)
+        while done < last:
+            at = np.int64(queue[done])
+            done += 1
             for middle in (at - stride, at, at + stride):
                 for other in range(middle - 1, middle + 2):
-                    if map_[other] == 1:
-                        map_[other] = 2
-                        stack[top] = other
-                        top += 1
+                    weak = map_[other] & 1  # no branch to guess, here too
+                    map_[other] += weak
+                    queue[last] = other
+                    last += weak
         count = np.int64(0)
         for v in range(margin, height - margin):
             first = (v + 1) * stride
-            for word in range(first // 8, first // 8 + stride // 8):
-                if words[word] & _STRONG:
-                    for u in range(8 * word - first - 1, 8 * word - first + 7):
-                        points[2 * count], points[2 * count + 1] = u, v
-                        inside = (u >= margin) & (u < width - margin)
-                        count += inside & (map_[first + u + 1] == 2)
+            for word in range(first // 8, first // 8 + across):
+                chosen = words[word] & _STRONG
+                while chosen:
+                    u = 8 * word - first - 1 + _first_point(chosen)
+                    points[2 * count], points[2 * count + 1] = u, v
+                    count += (u >= margin) & (u < width - margin)
+                    chosen &= chosen - 1
         return int(count)
 
     return find

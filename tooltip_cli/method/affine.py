@@ -19,6 +19,8 @@ _SINGULAR = 1e-12
 # Of `_affine_numba.background_fitter`; pixels are whole numbers or not.
 _ARGUMENTS = "{0}* {0}* f64* i64 f64* i64 i64 f64 f64 f64 f64* i32* i32* f64* f64* f64* f64* u8*"
 
+_SCRATCH = machine_code.Scratch()
+
 STILL: Floats = np.eye(2, 3)  # the model of a background that does not move
 STILL.flags.writeable = False
 
@@ -139,7 +141,11 @@ def fit_background(
             f"iterations, drop_fraction and keep_within are {iterations}, {drop_fraction} and "
             f"{keep_within}; expected at least 0, 0 to less than 1, and at least 0"
         )
-    if start is not None and not (start.shape == (2, 3) and np.isfinite(start).all()):
+    if (
+        start is not None
+        and start is not STILL  # looking takes as long as fitting to a hundred edges
+        and not (start.shape == (2, 3) and np.isfinite(start).all())
+    ):
         raise ValueError(f"start is {start}; expected a finite affine model of shape (2, 3)")
     if len(edges) < 3:
         return None
@@ -166,12 +172,14 @@ def _fit_compiled(
         "tooltip_cli.method._affine_numba", "background_fitter", _ARGUMENTS.format(kind)
     )
     fit = AffineFit(np.empty((2, 3)), np.empty(count), np.empty(count, np.bool_))
+    ranking, bins, sums, lower = _SCRATCH(None, _space)
+    ranking.array[:] = STILL if start is None else start
     found = background(
         np.ascontiguousarray(edges, pairs),
         np.ascontiguousarray(translations, pairs),
         np.ascontiguousarray(covariances, np.float64),
         count,
-        np.array(STILL if start is None else start, np.float64, order="C"),
+        ranking,
         start is not None,
         iterations,
         drop_fraction,
@@ -179,14 +187,19 @@ def _fit_compiled(
         _SINGULAR,
         np.empty((7, count)),
         np.empty(count, np.int32),
-        np.empty((4, 1024), np.int32),
-        np.empty(24),
-        np.empty(42),
+        bins,
+        sums,
+        lower,
         fit.model,
         fit.distances,
         fit.inliers.view(np.uint8),
     )
     return fit if found else None
+
+
+def _space() -> tuple[Floats, npt.NDArray[np.int32], Floats, Floats]:
+    """Return the part of the compiled form's scratch space that does not grow with the edges."""
+    return np.empty((2, 3)), np.empty((4, 1024), np.int32), np.empty(24), np.empty(42)
 
 
 def _fit_numpy(

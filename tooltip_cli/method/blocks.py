@@ -23,8 +23,8 @@ MAX_SEARCH = 71
 _ARGUMENTS = (  # of `_blocks_numba.matcher`
     "u8* u8* i64 i64 i32* i64 i32* i64 i64 f64 i32* u16* i64 u8* u16* i32* i32* f64*"
 )
-_NO_OFFSETS: Pixels = np.empty((0, 2), np.int32)
 _KERNELS = "tooltip_cli.method._blocks_numba"
+_SCRATCH = machine_code.Scratch()
 _SLOTS = 8  # edges that the compiled form compares before it looks at what came out
 _EDGES_AT_ONCE = 256  # bounds the temporaries of the numpy form to a few megabytes
 
@@ -157,23 +157,24 @@ def _match_compiled(
         sad=np.empty(len(edges), np.int32),
         covariances=np.empty((len(edges), 3)),
     )
-    ranks = rank_table(search, form)
     reach = search + block + 32  # what the compiled form may read from the start of a window's row
+    window, sads = _SCRATCH(constants, lambda: _space(block, search, form, reach))
+    steps, ranks = _tables(search, form)
     outside = match(
         first,
         second,
         *first.shape,
         edges,
         len(edges),
-        _NO_OFFSETS if offsets is None else offsets,
+        steps if offsets is None else offsets,
         0 if offsets is None else len(offsets),
         excess,
         alpha,
-        _displacements(search),
+        steps,
         ranks,
         reach,
-        np.zeros((search + block - 1, reach), np.uint8),
-        _at_cache_line(_SLOTS * ranks.size),
+        window,
+        sads,
         matches.translations,
         matches.sad,
         matches.covariances,
@@ -287,6 +288,18 @@ def rank_table(search: int, form: Form) -> npt.NDArray[np.uint16]:
     table[row, column] = np.arange(len(displacements))
     table.flags.writeable = False
     return table
+
+
+@functools.cache
+def _tables(search: int, form: Form) -> tuple[machine_code.Kept, machine_code.Kept]:
+    """Return the displacements and their ranks for the compiled form."""
+    return machine_code.Kept(_displacements(search)), machine_code.Kept(rank_table(search, form))
+
+
+def _space(block: int, search: int, form: Form, reach: int) -> tuple[Bytes, npt.NDArray[np.uint16]]:
+    """Return room for a search window and for the SADs of a few edges."""
+    window = np.zeros((search + block - 1, reach), np.uint8)
+    return window, _at_cache_line(_SLOTS * rank_table(search, form).size)
 
 
 def _at_cache_line(count: int) -> npt.NDArray[np.uint16]:

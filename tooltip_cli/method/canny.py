@@ -51,7 +51,7 @@ def _points_compiled(image: Image, low: float, high: float, margin: int) -> Pixe
     find = machine_code.kernel("tooltip_cli.method._canny_numba", "edge_finder", _ARGUMENTS)
     height, width = image.shape
     stride = (width + 9) // 8 * 8
-    marks = np.zeros((height + 2, stride), np.uint8)
+    marks = np.zeros((height + 2) * stride + 8, np.uint8)
     inside = (height - 2 * margin) * (width - 2 * margin)
     points = np.empty((inside + 8, 2), np.int32)  # some are written beyond the last
     count = find(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from tooltip_cli.errors import TooltipError, one_of
 from tooltip_cli.method import generative
 from tooltip_cli.method.generative import MixtureFit, Observations
 from tooltip_cli.method.kmeans import Clusters, kmeans, lloyd
-from tooltip_cli.method.rays import Pairs, angular_spread, intersections, plausible
+from tooltip_cli.method.rays import Pairs, angular_spread, meeting_points, pairs_of, plausible
 from tooltip_cli.method.types import (
     Array,
     Candidate,
@@ -23,6 +24,8 @@ from tooltip_cli.method.types import (
     refused,
 )
 from tooltip_cli.method.voting.params import VotingSettings
+
+_PAIRS_AT_ONCE = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -98,18 +101,25 @@ def hypotheses(data: EstimationInput, params: EstimatorParams) -> tuple[Array, P
 
     Where there are more pairs or points than the parameters allow, of a seeded sample.
     """
-    points, pairs = intersections(
+    meet = partial(
+        meeting_points,
         data.rays,
         max_distance=params.max_ray_distance,
         z_start=params.z_start,
-        max_pairs=params.max_pairs,
-        seed=params.seed,
     )
-    keep = np.flatnonzero(plausible(points, data.spheres, params.max_range))
+    first, second = pairs_of(len(data.rays), params.max_pairs, params.seed)
+    found = [np.zeros(0, np.int32)]
+    for start in range(0, len(first), _PAIRS_AT_ONCE):
+        part = slice(start, start + _PAIRS_AT_ONCE)
+        points, rows = meet(first[part], second[part])
+        found.append(start + rows[plausible(points, data.spheres, params.max_range)])
+    keep = np.concatenate(found)
     if len(keep) > params.max_points:
         rng = np.random.default_rng(params.seed)
         keep = np.sort(rng.choice(keep, params.max_points, replace=False))
-    return points[keep], pairs[keep]
+    first, second = first[keep], second[keep]
+    # found once more, as all that are not kept would take ten times the memory
+    return meet(first, second)[0], np.stack([first, second], axis=1)
 
 
 def estimate_kmeans(data: EstimationInput, params: EstimatorParams) -> TipEstimate:

@@ -81,27 +81,53 @@ def intersections(
         (M, 3) midpoints x_m in metres and (M, 2) indices of their rays, ordered by pair.
         O(min(N^2, max_pairs)) time and memory.
     """
-    first, second = _pairs_of(len(rays), max_pairs, seed)
-    points, rows = machine_code.fast_or_slow(
+    first, second = pairs_of(len(rays), max_pairs, seed)
+    points, rows = meeting_points(
+        rays, first, second, max_distance=max_distance, z_start=z_start, use_numba=use_numba
+    )
+    return points, np.stack([first[rows], second[rows]], axis=1)
+
+
+def meeting_points(
+    rays: Rays,
+    first: Pairs,
+    second: Pairs,
+    *,
+    max_distance: float,
+    z_start: float,
+    use_numba: bool | None = None,
+) -> tuple[Array, Pairs]:
+    """Hypothesise the intersection of those pairs that nearly meet.
+
+    Args are those of `intersections`, and (P,) ``first`` and ``second``, the pairs.
+
+    Returns:
+        (M, 3) midpoints in metres and (M,) which of the pairs they are of, ascending.
+    """
+    return machine_code.fast_or_slow(
         lambda: _intersect_compiled(rays, first, second, max_distance, z_start),
         lambda: _intersect_numpy(rays, first, second, max_distance, z_start),
         use_numba,
     )
-    pairs = np.empty((len(rows), 2), dtype=np.int32)
-    pairs[:, 0], pairs[:, 1] = first[rows], second[rows]
-    return points, pairs
 
 
-def _pairs_of(count: int, most: int, seed: int) -> tuple[Pairs, Pairs]:
+def pairs_of(count: int, most: int, seed: int) -> tuple[Pairs, Pairs]:
     """Return (P,) and (P,) the rays of all pairs, the lower one first, or of a sample of them."""
-    if count * (count - 1) // 2 <= most:
-        first, second = np.triu_indices(count, k=1)
-        return first.astype(np.int32), second.astype(np.int32)
+    total = count * (count - 1) // 2
+    if total <= most:
+        rows = np.arange(count, dtype=np.int32)
+        first = np.repeat(rows, rows[::-1])
+        # in its row a pair stands as many places to the right as come before the row
+        before = np.cumsum(rows[::-1], dtype=np.int32) - rows[::-1]
+        second = np.arange(total, dtype=np.int32)
+        second += np.repeat(rows + 1 - before, rows[::-1])
+        return first, second
     rng = np.random.default_rng(seed)
     one = rng.integers(count, size=most, dtype=np.int32)
     other = rng.integers(count - 1, size=most, dtype=np.int32)
     other += other >= one  # any but the one
-    return np.minimum(one, other), np.maximum(one, other)
+    first = np.minimum(one, other)
+    return first, np.maximum(one, other, out=other)
 
 
 def _intersect_compiled(

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.log.detections import read_detections, read_provenance, write_detections
-from tooltip_cli.log.recording import Recording, Topics, read_recording
+from tooltip_cli.log.recording import LoggedImage, Recording, Topics, read_recording
 from tooltip_cli.method.detector import (
     Detections,
     DetectorParams,
+    Image,
     TipDetection,
     detect_tip,
     find_edges,
@@ -26,12 +28,11 @@ from tooltip_cli.stages.artifacts import (
     provenance,
     stage_key,
 )
-from tooltip_cli.stages.clock import laps
-from tooltip_cli.stages.threads import in_order
+from tooltip_cli.stages.clock import Lap, laps
+from tooltip_cli.stages.passes import Job, look_through
 
 SUFFIX = ".detections.mcap"
 VERSION = 1
-_PAIRS_A_TASK = 32
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -84,8 +85,13 @@ def detect_in(
     force: bool = False,
     jobs: int = 1,
     on_pair: Callable[[], None] = lambda: None,
+    along: Sequence[Job[Any]] = (),
 ) -> Detected:
-    """Do the same for a recording that is already open; see :func:`detect`."""
+    """Do the same for a recording that is already open; see :func:`detect`.
+
+    Args:
+        along: who is to see the images in the same pass, where one is made.
+    """
     params = params or DetectorParams()
     key = detection_key(recording, params)
     if not force:
@@ -100,12 +106,10 @@ def detect_in(
         )
     path = artifact_path(recording.path, SUFFIX, out)
     ensure_directory(path.parent)
-    rows = []
-    for row in _detect_pairs(recording, params, jobs):
-        rows.append(row)
-        on_pair()
+    pairs = _Pairs(len(recording.image_stamps_ns), params, on_pair)
+    look_through(recording, [pairs, *along], jobs)
     lap = laps()
-    detections = _table(rows)
+    detections = _table(pairs.rows)
     write_detections(
         path,
         detections,
@@ -129,27 +133,46 @@ def _stored(place: Path, key: str, recording: Recording) -> Detections | None:
         return None
 
 
-def _detect_pairs(
-    recording: Recording, params: DetectorParams, jobs: int
-) -> Iterator[TipDetection]:
-    """Yield detections in frame order; chunks of pairs run on threads, a few ahead."""
-    starts = range(0, len(recording.image_stamps_ns) - 1, _PAIRS_A_TASK)
-    return in_order(lambda start: _detect_chunk(recording, params, start), starts, jobs)
+class _Pairs:
+    """The job of finding the tip in all pairs of ``count`` images."""
+
+    def __init__(self, count: int, params: DetectorParams, on_pair: Callable[[], None]) -> None:
+        self.rows: list[TipDetection] = []
+        self._count, self._params, self._on_pair = count, params, on_pair
+
+    def part(self, start: int, stop: int) -> _SomePairs:
+        """Return the pairs whose first images these are."""
+        return _SomePairs(range(start, min(stop + 1, self._count)), self._params)
+
+    def add(self, result: list[TipDetection]) -> None:
+        """Take detections."""
+        self.rows += result
+        for _ in result:
+            self._on_pair()
 
 
-def _detect_chunk(recording: Recording, params: DetectorParams, start: int) -> list[TipDetection]:
-    stop = min(start + _PAIRS_A_TASK, len(recording.image_stamps_ns) - 1)
-    lap = laps()
-    images = recording.images(range(start, stop + 1), gray=True)
-    first = next(images)
-    rows = []
-    for second in images:
+class _SomePairs:
+    """The pairs of some consecutive images."""
+
+    def __init__(self, images: range, params: DetectorParams) -> None:
+        self.wanted = frozenset(images) if len(images) > 1 else frozenset()
+        self._params = params
+        self._first: Image | None = None
+        self._rows: list[TipDetection] = []
+
+    def take(self, index: int, image: LoggedImage, lap: Lap) -> None:
+        """Compare an image with the one before."""
+        second = image.gray
         lap("decode")
-        edges = find_edges(first, params)
-        lap("edges")
-        rows.append(detect_tip(first, second, edges, params, lap))
-        first = second
-    return rows
+        if self._first is not None:
+            edges = find_edges(self._first, self._params)
+            lap("edges")
+            self._rows.append(detect_tip(self._first, second, edges, self._params, lap))
+        self._first = second
+
+    def result(self) -> list[TipDetection]:
+        """Return the detections."""
+        return self._rows
 
 
 def _table(rows: list[TipDetection]) -> Detections:

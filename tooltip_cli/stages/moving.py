@@ -6,13 +6,14 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.log.detections import read_provenance
 from tooltip_cli.log.edges import read_edges, write_edges
-from tooltip_cli.log.recording import Recording
+from tooltip_cli.log.recording import LoggedImage, Recording
 from tooltip_cli.log.views import Views
 from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.moving import (
@@ -26,6 +27,7 @@ from tooltip_cli.method.voting.moving import (
 )
 from tooltip_cli.method.voting.pairing import Pairing
 from tooltip_cli.method.voting.params import MovingParams, VotingSettings
+from tooltip_cli.method.voting.silhouette import FrameSilhouette
 from tooltip_cli.rig.camera import CameraModel
 from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.stages.artifacts import (
@@ -36,13 +38,12 @@ from tooltip_cli.stages.artifacts import (
     provenance,
     stage_key,
 )
-from tooltip_cli.stages.clock import laps
+from tooltip_cli.stages.clock import Lap, laps
+from tooltip_cli.stages.passes import look_through
 from tooltip_cli.stages.scene import Scene
-from tooltip_cli.stages.threads import in_order
 
 SUFFIX = ".edges.mcap"
 VERSION = 3
-_FRAMES_A_TASK = 16
 _NOISE_PAIRS = 8
 _LOGGER = logging.getLogger(__name__)
 
@@ -55,6 +56,44 @@ class DetectedEdges:
     key: str
     reused: bool
     edges: MovingEdges
+
+
+@dataclass(frozen=True)
+class PendingEdges:
+    """Edges that are still to be found.
+
+    Attributes:
+        job: who is to look at the images, perhaps in a pass with others.
+    """
+
+    recording: Recording
+    path: Path
+    key: str
+    params: dict[str, Any]
+    job: FramesJob
+
+    def finish(self, jobs: int = 1, on_frame: Callable[[], None] = lambda: None) -> DetectedEdges:
+        """Look at the images, if that was not done yet, and write what was found.
+
+        Raises:
+            TooltipError: an image cannot be decoded, or the artifact not written.
+        """
+        recording = self.recording
+        if not self.job.done:
+            self.job.on_frame = on_frame
+            look_through(recording, [self.job], jobs)
+        edges = self.job.edges()
+        lap = laps()
+        ensure_directory(self.path.parent)
+        write_edges(
+            self.path,
+            edges,
+            recording.image_stamps_ns,
+            recording.image_frame,
+            provenance(recording.path, recording.sha256, self.key, self.params),
+        )
+        lap("write")
+        return DetectedEdges(self.path, self.key, False, edges)
 
 
 def detect_edges_in(
@@ -80,6 +119,24 @@ def detect_edges_in(
     Raises:
         TooltipError: an image cannot be decoded, or the artifact not written.
     """
+    found = known_edges(recording, views, pairing, settings, out=out, force=force)
+    return found if isinstance(found, DetectedEdges) else found.finish(jobs, on_frame)
+
+
+def known_edges(
+    recording: Recording,
+    views: Views,
+    pairing: Pairing,
+    settings: VotingSettings,
+    *,
+    out: Path | None = None,
+    force: bool = False,
+) -> DetectedEdges | PendingEdges:
+    """Return the edges that are stored, or what will find them; see `detect_edges_in`.
+
+    Raises:
+        TooltipError: an image cannot be decoded.
+    """
     params = {"moving": settings.moving, "silhouette": settings.silhouette}
     centres, radii = hand_in_image(views, pairing.frames, settings.moving.reach)
     parents = {
@@ -97,19 +154,8 @@ def detect_edges_in(
             stored = _stored(place, key, recording)
             if stored is not None:
                 return DetectedEdges(place, key, True, stored)
-    edges = find_moving_edges(recording, views, pairing, settings, jobs, on_frame)
-    lap = laps()
-    path = artifact_path(recording.path, SUFFIX, out)
-    ensure_directory(path.parent)
-    write_edges(
-        path,
-        edges,
-        recording.image_stamps_ns,
-        recording.image_frame,
-        provenance(recording.path, recording.sha256, key, params),
-    )
-    lap("write")
-    return DetectedEdges(path, key, False, edges)
+    job = FramesJob(recording, views, pairing, settings)
+    return PendingEdges(recording, artifact_path(recording.path, SUFFIX, out), key, params, job)
 
 
 def _stored(place: Path, key: str, recording: Recording) -> MovingEdges | None:
@@ -130,29 +176,117 @@ def find_moving_edges(
     pairing: Pairing,
     settings: VotingSettings,
     jobs: int,
-    on_frame: Callable[[], None],
 ) -> MovingEdges:
     """Find the edges and silhouettes of all chosen frames; they do not depend on ``jobs``."""
-    lap = laps()
-    noise = _noise(recording, pairing)
-    lap("decode")
-    scene = Scene(recording, views, pairing.frames, settings.silhouette)
-    lap("background")
-    parts: list[FrameEdges] = []
-    starts = range(0, len(pairing.frames), _FRAMES_A_TASK)
+    job = FramesJob(recording, views, pairing, settings)
+    look_through(recording, [job], jobs)
+    return job.edges()
 
-    def work(start: int) -> list[FrameEdges]:
-        edges = _chunk(recording, views, pairing, noise, settings.moving, start)
-        shown = scene.silhouettes(pairing.frames[start : start + _FRAMES_A_TASK])
-        return [
-            replace(part, silhouette=silhouette)
-            for part, silhouette in zip(edges, shown, strict=True)
-        ]
 
-    for part in in_order(work, starts, jobs):
-        parts.append(part)
-        on_frame()
-    return join(pairing.frames, pairing.partners, parts)
+class FramesJob:
+    """The job of finding the edges and silhouettes of all chosen frames.
+
+    Making it looks at a few images, for the noise and for the scene behind the hand.
+
+    Attributes:
+        on_frame: called after every frame, for progress.
+    """
+
+    def __init__(
+        self, recording: Recording, views: Views, pairing: Pairing, settings: VotingSettings
+    ) -> None:
+        lap = laps()
+        noise = _noise(recording, pairing)
+        lap("decode")
+        scene = Scene(recording, views, pairing.frames, settings.silhouette)
+        lap("background")
+        self.on_frame: Callable[[], None] = lambda: None
+        self._pairing, self._found = pairing, list[FrameEdges]()
+        self._finder = _Finder(views, scene, noise, settings.moving)
+
+    @property
+    def done(self) -> bool:
+        """Whether all images have been looked at."""
+        return len(self._found) == len(self._pairing.frames)
+
+    def part(self, start: int, stop: int) -> _SomeFrames:
+        """Return the chosen ones of some images."""
+        rows = slice(*np.searchsorted(self._pairing.frames, [start, stop]))
+        return _SomeFrames(self._finder, self._pairing.frames[rows], self._pairing.partners[rows])
+
+    def add(self, result: list[FrameEdges]) -> None:
+        """Take the edges of some frames."""
+        self._found += result
+        for _ in result:
+            self.on_frame()
+
+    def edges(self) -> MovingEdges:
+        """Return what was found."""
+        return join(self._pairing.frames, self._pairing.partners, self._found)
+
+
+@dataclass(frozen=True)
+class _Finder:
+    """What finding the edges of any frame takes."""
+
+    views: Views
+    scene: Scene
+    noise: float
+    params: MovingParams
+
+
+class _SomeFrames:
+    """Some chosen frames (F,) with their partners (F, 2), before and after.
+
+    Memory: the images from a frame's first partner to its second.
+    """
+
+    def __init__(self, finder: _Finder, frames: Indices, partners: Indices) -> None:
+        self.wanted = frozenset(map(int, (*frames, *partners.ravel())))
+        self._finder, self._frames, self._partners = finder, frames, partners
+        self._centres, self._radii = hand_in_image(finder.views, frames, finder.params.reach)
+        self._smoothed: dict[int, Image] = {}
+        self._silhouettes: list[FrameSilhouette] = []
+        self._found: list[FrameEdges] = []
+
+    def take(self, index: int, image: LoggedImage, lap: Lap) -> None:
+        """Look at a frame or a partner."""
+        gray = image.gray
+        lap("decode")
+        self._smoothed[index] = smooth(gray, self._finder.params)
+        lap("moving edges")
+        if index in self._frames:
+            colour = image.decode(gray=False)
+            lap("decode")
+            turned = self._finder.views.root_from_camera[index]
+            self._silhouettes.append(self._finder.scene.silhouette(colour, turned))
+            lap("silhouettes")
+        while len(self._found) < len(self._frames) and self._last_of_next() <= index:
+            self._found.append(self._next())
+            wanted = self._partners[len(self._found) :]
+            for past in [i for i in self._smoothed if not len(wanted) or i < wanted.min()]:
+                del self._smoothed[past]
+        lap("moving edges")
+
+    def result(self) -> list[FrameEdges]:
+        """Return the frames' edges and silhouettes."""
+        return self._found
+
+    def _last_of_next(self) -> int:
+        return int(self._partners[len(self._found), 1])
+
+    def _next(self) -> FrameEdges:
+        row = len(self._found)
+        before, after = (self._smoothed[int(index)] for index in self._partners[row])
+        edges = moving_edges(
+            self._smoothed[int(self._frames[row])],
+            (before, after),
+            self._centres[row],
+            float(self._radii[row]),
+            self._finder.noise,
+            self._finder.params,
+        )
+        return replace(edges, silhouette=self._silhouettes[row])
 
 
 def _noise(recording: Recording, pairing: Pairing) -> float:
@@ -161,41 +295,6 @@ def _noise(recording: Recording, pairing: Pairing) -> float:
     wanted = [i for row in rows for i in (pairing.frames[row], pairing.partners[row, 1])]
     images = list(recording.images(wanted, gray=True))
     return noise_level(list(zip(images[::2], images[1::2], strict=True)))
-
-
-def _chunk(
-    recording: Recording,
-    views: Views,
-    pairing: Pairing,
-    noise: float,
-    params: MovingParams,
-    start: int,
-) -> list[FrameEdges]:
-    frames = pairing.frames[start : start + _FRAMES_A_TASK]
-    partners = pairing.partners[start : start + _FRAMES_A_TASK]
-    needed = np.unique(np.concatenate([frames, partners.ravel()]))
-    lap = laps()
-    images: dict[int, Image] = {}
-    for index, image in zip(needed, recording.images(needed, gray=True), strict=True):
-        lap("decode")
-        images[int(index)] = smooth(image, params)
-        lap("moving edges")
-    centres, radii = hand_in_image(views, frames, params.reach)
-    found = [
-        moving_edges(
-            images[int(frame)],
-            (images[int(before)], images[int(after)]),
-            centre,
-            float(radius),
-            noise,
-            params,
-        )
-        for frame, (before, after), centre, radius in zip(
-            frames, partners, centres, radii, strict=True
-        )
-    ]
-    lap("moving edges")
-    return found
 
 
 def hand_in_image(views: Views, frames: Indices, reach: float) -> tuple[Array, Array]:

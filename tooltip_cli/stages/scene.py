@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Iterator
 from typing import Protocol
 
@@ -9,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tooltip_cli.log.views import Views
-from tooltip_cli.method.types import Indices
+from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.params import SilhouetteParams
 from tooltip_cli.method.voting.silhouette import (
     NOTHING_KNOWN,
@@ -20,7 +21,6 @@ from tooltip_cli.method.voting.silhouette import (
     silhouette,
 )
 from tooltip_cli.rig.camera import CameraModel
-from tooltip_cli.stages.clock import laps
 
 Map = npt.NDArray[np.float32]
 
@@ -58,24 +58,14 @@ class Scene:
         count = int(_MEMORY / (3 * views.camera.width * views.camera.height))
         count = min(params.samples, max(count, _FEWEST_SAMPLES), len(frames))
         chosen = frames[np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
-        samples = []
-        for index, image in zip(chosen, pictures.images(chosen), strict=True):
+        samples = np.empty(0, np.uint8)
+        for row, (index, image) in enumerate(zip(chosen, pictures.images(chosen), strict=True)):
+            if not row:  # filled in place, as a second copy of so much memory would count
+                samples = np.empty((len(chosen), *_channels(image).shape), np.uint8)
             # pixels of the reference, looked up in this image
             turn = self._turn(views.root_from_camera[index], self._reference)
-            samples.append(image if turn is None else _looked_up(image, turn))
-        self._backdrop = learn_backdrop(np.stack([_channels(image) for image in samples]), params)
-
-    def silhouettes(self, frames: Indices) -> Iterator[FrameSilhouette]:
-        """Yield what stands before the scene in images, by their indices.
-
-        Raises:
-            TooltipError: an image cannot be decoded.
-        """
-        lap = laps()
-        for index, image in zip(frames, self._pictures.images(frames), strict=True):
-            lap("decode")
-            yield self.silhouette(image, self._views.root_from_camera[index])
-            lap("silhouettes")
+            samples[row] = _channels(image if turn is None else _looked_up(image, turn))
+        self._backdrop = learn_backdrop(samples, params)
 
     def silhouette(
         self, image: Image, root_from_camera: npt.NDArray[np.float64]
@@ -115,17 +105,25 @@ def turn_map(camera: CameraModel, there_from_here: npt.NDArray[np.float64]) -> M
     Args:
         there_from_here: (3, 3) rotation between the camera's two orientations.
     """
+    here, directions = _grid(camera)
+    there = camera.project(directions @ there_from_here.T)
+    if np.nanmax(np.abs(there - here)) < _STILL_PX:
+        return None
+    coarse = np.nan_to_num(there, nan=_OUTSIDE).astype(np.float32)
+    columns, rows = _GRID
+    down, across = _linear(rows, camera.height), _linear(columns, camera.width)
+    return np.stack([down @ coarse[..., axis] @ across.T for axis in (0, 1)], axis=-1)
+
+
+@functools.lru_cache(maxsize=4)
+def _grid(camera: CameraModel) -> tuple[Array, Array]:
+    """Return (R, C, 2) pixels all over an image and (R, C, 3) their viewing directions."""
     columns, rows = _GRID
     u, v = np.meshgrid(
         np.linspace(0, camera.width - 1, columns), np.linspace(0, camera.height - 1, rows)
     )
-    here = np.stack([u, v], axis=-1)
-    there = camera.project(camera.directions(here) @ there_from_here.T)
-    if np.nanmax(np.abs(there - here)) < _STILL_PX:
-        return None
-    coarse = np.nan_to_num(there, nan=_OUTSIDE).astype(np.float32)
-    down, across = _linear(rows, camera.height), _linear(columns, camera.width)
-    return np.stack([down @ coarse[..., axis] @ across.T for axis in (0, 1)], axis=-1)
+    pixels = np.stack([u, v], axis=-1)
+    return pixels, camera.directions(pixels)
 
 
 def _linear(count: int, size: int) -> Map:

@@ -21,7 +21,13 @@ from tooltip_cli.method.voting.volume import HandEdges
 from tooltip_cli.rig.camera import CameraModel
 from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.stages.held_out import unlabelled
-from tooltip_cli.stages.moving import DetectedEdges, detect_edges_in, image_extent
+from tooltip_cli.stages.moving import (
+    DetectedEdges,
+    PendingEdges,
+    detect_edges_in,
+    image_extent,
+    known_edges,
+)
 
 
 def pair_views(
@@ -70,36 +76,27 @@ def vote(
     return estimate_by_voting(edges, spheres, settings), detected
 
 
-def detect_for_voting(
+def edges_for_voting(
     recording: Recording,
     views: Views,
     settings: VotingSettings,
     *,
     out: Path | None = None,
     force: bool = False,
-    jobs: int = 1,
-    on_frame: Callable[[], None] = lambda: None,
-) -> DetectedEdges | Reason:
-    """Find the moving edges that the estimate will ask for, or why the motion shows nothing.
+) -> DetectedEdges | PendingEdges | Reason:
+    """Return the moving edges that the estimate will ask for, or what will find them.
+
+    A reason: the motion shows nothing.
 
     Raises:
-        TooltipError: an image cannot be decoded, or the edges not written.
+        TooltipError: an image cannot be decoded.
     """
     allowed = unlabelled(recording, views.camera, out)
     pairing, camera_from_hand = pair_views(views, settings, allowed)
     reason = check_motion(pairing, camera_from_hand, settings)
     if reason is not None:
         return reason
-    return detect_edges_in(
-        recording,
-        views,
-        pairing,
-        settings,
-        out=out,
-        force=force,
-        jobs=jobs,
-        on_frame=on_frame,
-    )
+    return known_edges(recording, views, pairing, settings, out=out, force=force)
 
 
 def hand_edges(

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from tooltip_cli.method.rays import angular_spread
 from tooltip_cli.method.types import Array, Candidate, Reason, TipEstimate, refused
-from tooltip_cli.method.voting.end import tool_shape
-from tooltip_cli.method.voting.ends import find_ends
 from tooltip_cli.method.voting.pairing import Pairing
 from tooltip_cli.method.voting.params import TrustParams, VotingSettings
-from tooltip_cli.method.voting.volume import Cloud, HandEdges, reconstruct
+
+if TYPE_CHECKING:
+    from tooltip_cli.method.voting.volume import Cloud, HandEdges
 
 METHOD = "voting"
 _FRAMES_FOR_SPREAD = 10  # fewer cannot show that the camera keeps to one side of the hand
@@ -57,6 +59,11 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     Args:
         spheres: (S, 4) centre and radius of hand and wrist, metres.
     """
+    # here, as whoever only looks whether the motion will do has no use for them
+    from tooltip_cli.method.voting.end import tool_shape
+    from tooltip_cli.method.voting.ends import find_ends
+    from tooltip_cli.method.voting.volume import reconstruct
+
     used = len(edges.moving.frames)
     cloud = reconstruct(edges, settings.voting)
     shape = tool_shape(cloud, spheres, edges.reach, settings.end)

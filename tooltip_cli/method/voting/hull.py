@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from tooltip_cli import machine_code
 from tooltip_cli.method.rays import plausible
 from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.end import Shape
+from tooltip_cli.method.voting.loops import run
 from tooltip_cli.method.voting.params import HullParams
 from tooltip_cli.method.voting.silhouette import FOREGROUND, UNKNOWN, HandSilhouettes, Image
-from tooltip_cli.method.voting.volume import KERNELS, grid_axis
+from tooltip_cli.method.voting.volume import grid_axis
 
 _CARVER = "f64* i64 f64* u8* i64* i64 i64 i64 i64 i32* i32*"
 _MIN_VOXELS = 8  # smaller pieces are specks
@@ -103,7 +103,9 @@ def _carve(
     They are looked at in this order, until more than ``limit`` show background.
     """
     inside, carved = np.zeros((2, len(voxels)), dtype=np.int32)
-    machine_code.kernel(KERNELS, "carver", _CARVER)(
+    run(
+        "carver",
+        _CARVER,
         np.ascontiguousarray(voxels),
         len(voxels),
         cameras,

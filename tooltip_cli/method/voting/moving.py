@@ -131,6 +131,7 @@ def moving_edges(
     du, dv = edges[:, 0] - hand_pixel[0], edges[:, 1] - hand_pixel[1]
     # a mask as an index takes ten times as long with rows of two
     near = np.compress(du * du + dv * dv < hand_radius_px**2, edges, axis=0)
+    place = near[:, 1] * image.shape[1] + near[:, 0]  # in all pixels, row by row
     changed = np.zeros(len(near), dtype=bool)
     sample = _sample(edges, params)
     for side, other in enumerate(others):
@@ -138,7 +139,7 @@ def moving_edges(
         if model is None:
             return _nothing(affines)
         affines[side] = model
-        changed |= _changed(image, other, model, noise, params)[near[:, 1], near[:, 0]]
+        changed |= _changed(image, other, model, noise, params).ravel().take(place)
     edges = np.compress(changed, near, axis=0)
     matches = [
         match_blocks(
@@ -213,7 +214,8 @@ def _changed(
         )
     difference = cv2.blur(cv2.absdiff(image, other), (3, 3))
     spread = cv2.dilate(difference, np.ones((_CHANGE_REACH, _CHANGE_REACH), np.uint8))
-    return np.asarray(spread > max(params.change, 2.0 * noise))
+    least = min(max(params.change, 2.0 * noise), 255.0)
+    return np.asarray(spread > np.uint8(least))  # whole numbers exceed it as they do its floor
 
 
 def _nothing(affines: Array) -> FrameEdges:

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tooltip_cli import machine_code
 from tooltip_cli.method.types import Array, Indices
+from tooltip_cli.method.voting.loops import run
 from tooltip_cli.method.voting.params import RefineParams
 from tooltip_cli.method.voting.silhouette import HandSilhouettes
-from tooltip_cli.method.voting.volume import KERNELS, Cloud, HandEdges
+from tooltip_cli.method.voting.volume import Cloud, HandEdges
 
 _CHOOSER = (
     "f64* i64* f32* f64* f64* i64 i64 f64* f64* f64* f64* f64* f64* "
@@ -241,7 +241,9 @@ def _on_tool(
     """
     rows = np.empty(len(near.rows), dtype=np.intp)
     along, across, lengthwise = np.empty((3, len(near.rows)))
-    count = machine_code.kernel(KERNELS, "chooser", _CHOOSER)(
+    count = run(
+        "chooser",
+        _CHOOSER,
         near.pixels,
         near.rows,
         near.profiles,

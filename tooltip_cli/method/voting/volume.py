@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tooltip_cli import machine_code
 from tooltip_cli.method.types import Array, Indices
+from tooltip_cli.method.voting.loops import run
 from tooltip_cli.method.voting.moving import MovingEdges
 from tooltip_cli.method.voting.params import VotingParams
 from tooltip_cli.method.voting.silhouette import HandSilhouettes
@@ -25,7 +25,6 @@ _SMEAR = 1  # cells around an edge within which a voxel counts as near it
 _SUBSTEPS = 3  # depths tried between two samples of a profile, once the volume is fine
 _FINE_SCORE = 0.02  # share of expected frames, in the fine volume
 
-KERNELS = "tooltip_cli.method._voting_numba"
 _PROFILER = "f64* f64* f32* f64* i64* i64 f64* f64* i64 f64 f64 f32*"
 _VOTER = (
     "f64* i64 f64 f64* f64* i64 f64 f64 f64 i64 i64 i32* f32* i64 f64* f64 f64 "
@@ -129,7 +128,9 @@ def _depth_profiles(
     hand_from_camera = np.linalg.inv(camera[moving.frames])
     between = camera[moving.partners] @ hand_from_camera[:, None]
     profiles = np.zeros((len(rows), params.depths), dtype=np.float32)
-    machine_code.kernel(KERNELS, "profiler", _PROFILER)(
+    run(
+        "profiler",
+        _PROFILER,
         edges.points,
         np.ascontiguousarray(edges.focal_px * edges.moved),
         moving.covariances,
@@ -162,7 +163,9 @@ def _vote(
     camera = edges.camera_from_hand[:, :3]
     frames, n = edges.moving.frames[::every], len(axis)
     raster, nearest = _nearest_edges(edges, points[voting], rows[voting] // every, len(frames))
-    machine_code.kernel(KERNELS, "voter", _VOTER)(
+    run(
+        "voter",
+        _VOTER,
         axis,
         n,
         edges.reach,
@@ -220,7 +223,9 @@ def _place(
     positions = np.zeros((len(points), 3))
     scores = np.zeros(len(points))
     hand_from_camera = np.linalg.inv(edges.camera_from_hand[edges.moving.frames])
-    machine_code.kernel(KERNELS, "placer", _PLACER)(
+    run(
+        "placer",
+        _PLACER,
         np.ascontiguousarray(points),
         rows.astype(np.int64),
         np.ascontiguousarray(profiles),

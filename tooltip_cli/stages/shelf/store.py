@@ -7,6 +7,7 @@ provider's tools do, and nothing here takes, passes on, or repeats any.
 from __future__ import annotations
 
 import io
+import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -148,7 +149,10 @@ def store_errors(where: Remote, verb: str) -> Iterator[None]:
         raise TooltipError(f"{where}: is not there") from None
     except Exception as error:  # each provider has its own kinds; a chained one would be printed
         what = f"{type(error).__name__}: {without_secrets(str(error))}"
-        raise TooltipError(f"{where}: cannot be {verb} ({what})") from None
+        raise TooltipError(
+            f"{where}: cannot be {verb} ({what}); check the address, the network, and that the "
+            "provider's own tools have credentials here (docs/scale.md)"
+        ) from None
 
 
 def _open(where: Remote) -> tuple[Any, str]:
@@ -161,6 +165,8 @@ def _open(where: Remote) -> tuple[Any, str]:
         fsspec.get_filesystem_class(protocol)
     except ImportError:
         raise MissingExtraError(f"{protocol}://", extra, module) from None
+    # gcsfs logs each failure with its traceback, and its request with what may be a secret
+    logging.getLogger(module).setLevel(logging.CRITICAL + 1)
     files, path = fsspec.core.url_to_fs(where.url)
     return files, path
 
