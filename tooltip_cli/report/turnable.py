@@ -53,6 +53,15 @@ _AXIS_M = (0.06, 0.02)  # how far back from a tip its axis is drawn, and how far
 _SEED = 0  # of which rays and points are shown where there are more
 
 
+_COLUMNS = (
+    "panel",
+    "kind",
+    "cluster",
+    "share",
+    *(f"{axis}{end}_m" for end in "12" for axis in "xyz"),
+)
+
+
 @dataclass(frozen=True)
 class Panel:
     """One cloud of rays and what was made of it; metres, hand frame."""
@@ -110,8 +119,11 @@ def rays_figure(row: RecordingReport, scene: Scene) -> Drawing | None:
         "The tip in the hand frame",
         f"Hand, tool and viewing rays of {row.name} in the hand frame, seen from the side. {text}.",
         f"{words.sentence(text)} {_key(row, shown)}",
-        ("panel", "kind", "cluster", "share", "x1_m", "y1_m", "z1_m", "x2_m", "y2_m", "z2_m"),
-        [line for panel in shown for line in _rows(panel)],
+        _COLUMNS,
+        [
+            *_common_rows(basis, center, radius, spheres, row),
+            *(line for panel in shown for line in _rows(panel)),
+        ],
     )
     payload = json.dumps(_payload(shown, basis, center, radius, spheres, row)).replace("<", "")
     script = f'<script type="application/json">{payload}</script>'
@@ -338,40 +350,60 @@ def region_loops(score: EstimateScore, steps: int = 48) -> list[Array]:
     ]
 
 
-def _rows(panel: Panel) -> list[list[str]]:
-    def cells(*points: Array) -> list[str]:
-        return [f"{value:.5f}" for point in points for value in point]
+def _line(
+    panel: str, kind: str, *ends: Array, cluster: str = "", share: str = "", digits: int = 5
+) -> list[str]:
+    """Return a row of the figure's data: one place in the hand frame, or two."""
+    cells = [f"{value:.{digits}f}" for end in ends for value in end]
+    return [panel, kind, cluster, share, *cells, *[""] * (6 - len(cells))]
 
-    rays = [
-        [panel.title, "ray", "", "", *cells(start, end)]
-        for start, end in zip(panel.starts, panel.ends, strict=True)
+
+def _common_rows(
+    basis: Array, center: Array, radius: float, spheres: Array, row: RecordingReport
+) -> list[list[str]]:
+    """Return what all panels share: the view, the hand's spheres and the true tip.
+
+    The second place of a view is at the picture's right or upper edge, of a sphere on its surface.
+    """
+    right, up = center + radius * basis[:2]
+    lines = [_line("all", "view right", center, right), _line("all", "view up", center, up)]
+    lines += [
+        _line("all", "sphere", sphere[:3], sphere[:3] + sphere[3] * np.eye(3)[0])
+        for sphere in spheres
     ]
-    kind = "intersection" if panel.shares is None else "voted"
-    points = [
-        [panel.title, kind, str(int(cluster)), "", *cells(point), "", "", ""]
-        for point, cluster in zip(panel.points, panel.clusters, strict=True)
-    ]
-    for line, share in zip(points, [] if panel.shares is None else panel.shares, strict=False):
-        line[2:4] = ["", number(float(share), 3)]
-    estimate = panel.estimate
-    if estimate is None or estimate.position_m is None:
-        return rays + points
-    places = [np.array(item.position_m) for item in estimate.candidates]
-    places = places or [np.array(estimate.position_m)]
-    candidates = [
-        [
-            panel.title,
-            "candidate" if index else "estimate",
-            str(index),
-            "",
-            *cells(place),
-            "",
-            "",
-            "",
+    if row.truth_m is not None:
+        lines.append(_line("all", "true tip", np.array(row.truth_m)))
+    return lines
+
+
+def _rows(panel: Panel) -> list[list[str]]:
+    title, estimate = panel.title, panel.estimate
+    lines = [_line(title, "ray", *ends) for ends in zip(panel.starts, panel.ends, strict=True)]
+    if panel.shares is None:
+        lines += [
+            _line(title, "intersection", point, cluster=str(int(cluster)))
+            for point, cluster in zip(panel.points, panel.clusters, strict=True)
         ]
+    else:
+        lines += [
+            _line(title, "voted", point, share=number(float(share), 3))
+            for point, share in zip(panel.points, panel.shares, strict=True)
+        ]
+    if estimate is None or estimate.position_m is None:
+        return lines
+    tip = np.array(estimate.position_m)
+    places = [np.array(item.position_m) for item in estimate.candidates] or [tip]
+    lines += [
+        _line(title, "candidate" if index else "estimate", place, cluster=str(index))
         for index, place in enumerate(places)
     ]
-    return [*rays, *points, *candidates]
+    along = axis_ends(estimate)
+    if along is not None:
+        lines.append(_line(title, "tool's axis", *along))
+    if estimate.region_mm is not None and estimate.region_axes is not None:
+        semi = np.array(estimate.region_axes) * np.array(estimate.region_mm)[:, None] / 1000
+        lines += [_line(title, "95 % semi-axis", tip, tip + axis, digits=7) for axis in semi]
+    return lines
 
 
 def _payload(
