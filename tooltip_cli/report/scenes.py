@@ -232,7 +232,7 @@ def _edge_map(
         fast = motion.weights[order] > scene.detector.min_weight
         for x, y, color in zip(u[fast], v[fast], _ramp(strength[fast]), strict=True):
             cv2.circle(picture, (int(x), int(y)), _DOT_PX, color.tolist(), -1)
-        u_most, v_most = map(float, motion.edges[order[-1]])
+        u_most, v_most = map(float, motion.edges[np.argmax(motion.weights)])
         shapes = [Circle(u_most, v_most, 9 * picture.shape[1] / 640, overlay.WHITE)]
         heavy = int((motion.weights > scene.detector.min_weight).sum())
         words = (
@@ -245,7 +245,7 @@ def _edge_map(
             "ring marks the heaviest, the motion interest point (section 3.1)."
         )
         lines = zip(*motion.edges.T.tolist(), motion.weights.tolist(), strict=True)
-        data += "".join(f"{x},{y},{weight:.3f}\n" for x, y, weight in lines)
+        data += "".join(f"{x},{y},{weight:.6f}\n" for x, y, weight in lines)
     return overlay.drawing(
         f"{row.name}-edges",
         "Weighted edge map",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from tooltip_cli.log.views import Views
 from tooltip_cli.method.estimators import EstimatorParams
 from tooltip_cli.method.kmeans import nearest
 from tooltip_cli.method.rays import intersections, plausible, rays_in_hand, sphere_array
-from tooltip_cli.method.types import Array, Indices, Rays, TipPixels
+from tooltip_cli.method.types import Array, Rays, TipPixels
 from tooltip_cli.method.voting.estimate import METHOD as VOTING
 from tooltip_cli.report import words
 from tooltip_cli.report.charts import (
@@ -32,8 +32,8 @@ from tooltip_cli.report.charts import (
     styled,
 )
 from tooltip_cli.report.model import EstimateScore, RecordingReport
+from tooltip_cli.report.ray_panels import COLUMNS, Panel, axis_ends, common_rows, panel_rows
 from tooltip_cli.report.scenes import Scene
-from tooltip_cli.report.tables import number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,45 +49,7 @@ CLUSTER_COLORS = (  # told apart by most kinds of colour vision (Okabe and Ito),
     "#8a8a8a",
 )
 _MOST_RAYS, _MOST_POINTS = 160, 600
-_AXIS_M = (0.06, 0.02)  # how far back from a tip its axis is drawn, and how far beyond it
 _SEED = 0  # of which rays and points are shown where there are more
-
-
-_COLUMNS = (
-    "panel",
-    "kind",
-    "cluster",
-    "share",
-    *(f"{axis}{end}_m" for end in "12" for axis in "xyz"),
-)
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One cloud of rays and what was made of it; metres, hand frame."""
-
-    title: str
-    starts: Array  # (N, 3) where the rays are drawn from
-    ends: Array  # (N, 3)
-    points: Array  # (M, 3) hypothesised intersections
-    clusters: Indices  # (M,) nearest candidate of each
-    estimate: EstimateScore | None
-    rays: int  # before thinning out
-    hypotheses: int
-    shares: Array | None = None  # (M,) where points are what was voted: frames that agree on each
-    frames: int = 0  # that voted
-
-    @property
-    def words(self) -> str:
-        """What is drawn, with numbers."""
-        if self.shares is not None:
-            return f"{self.title}: {len(self.points)} places, from {self.frames} frames"
-        thinned = (
-            f" ({len(self.starts)} and {len(self.points)} of them drawn)"
-            if len(self.starts) < self.rays or len(self.points) < self.hypotheses
-            else ""
-        )
-        return f"{self.title}: {self.rays} rays, {self.hypotheses} intersections{thinned}"
 
 
 @styled
@@ -119,10 +81,10 @@ def rays_figure(row: RecordingReport, scene: Scene) -> Drawing | None:
         "The tip in the hand frame",
         f"Hand, tool and viewing rays of {row.name} in the hand frame, seen from the side. {text}.",
         f"{words.sentence(text)} {_key(row, shown)}",
-        _COLUMNS,
+        COLUMNS,
         [
-            *_common_rows(basis, center, radius, spheres, row),
-            *(line for panel in shown for line in _rows(panel)),
+            *common_rows(basis, center, radius, spheres, row),
+            *(line for panel in shown for line in panel_rows(panel)),
         ],
     )
     payload = json.dumps(_payload(shown, basis, center, radius, spheres, row)).replace("<", "")
@@ -299,16 +261,6 @@ def shades(shares: Array) -> Array:
     return np.asarray(0.2 + 0.8 * np.clip(shares / max(most, 1e-9), 0.0, 1.0))
 
 
-def axis_ends(score: EstimateScore) -> Array | None:
-    """Return (2, 3) the ends of the line that shows the tool's axis; None: not known."""
-    first = score.candidates[0] if score.candidates else None
-    if first is None or first.axis is None:
-        return None
-    back, beyond = _AXIS_M
-    tip, along = np.array(first.position_m), np.array(first.axis)
-    return np.stack([tip - back * along, tip + beyond * along])
-
-
 def _draw_estimate(axes: Axes, estimate: EstimateScore, flat: Any) -> None:
     along = axis_ends(estimate)
     if along is not None:
@@ -348,62 +300,6 @@ def region_loops(score: EstimateScore, steps: int = 48) -> list[Array]:
         np.array(score.position_m) + np.cos(angle) * axes[i] + np.sin(angle) * axes[j]
         for i, j in pairs
     ]
-
-
-def _line(
-    panel: str, kind: str, *ends: Array, cluster: str = "", share: str = "", digits: int = 5
-) -> list[str]:
-    """Return a row of the figure's data: one place in the hand frame, or two."""
-    cells = [f"{value:.{digits}f}" for end in ends for value in end]
-    return [panel, kind, cluster, share, *cells, *[""] * (6 - len(cells))]
-
-
-def _common_rows(
-    basis: Array, center: Array, radius: float, spheres: Array, row: RecordingReport
-) -> list[list[str]]:
-    """Return what all panels share: the view, the hand's spheres and the true tip.
-
-    The second place of a view is at the picture's right or upper edge, of a sphere on its surface.
-    """
-    right, up = center + radius * basis[:2]
-    lines = [_line("all", "view right", center, right), _line("all", "view up", center, up)]
-    lines += [
-        _line("all", "sphere", sphere[:3], sphere[:3] + sphere[3] * np.eye(3)[0])
-        for sphere in spheres
-    ]
-    if row.truth_m is not None:
-        lines.append(_line("all", "true tip", np.array(row.truth_m)))
-    return lines
-
-
-def _rows(panel: Panel) -> list[list[str]]:
-    title, estimate = panel.title, panel.estimate
-    lines = [_line(title, "ray", *ends) for ends in zip(panel.starts, panel.ends, strict=True)]
-    if panel.shares is None:
-        lines += [
-            _line(title, "intersection", point, cluster=str(int(cluster)))
-            for point, cluster in zip(panel.points, panel.clusters, strict=True)
-        ]
-    else:
-        lines += [
-            _line(title, "voted", point, share=number(float(share), 3))
-            for point, share in zip(panel.points, panel.shares, strict=True)
-        ]
-    if estimate is None or estimate.position_m is None:
-        return lines
-    tip = np.array(estimate.position_m)
-    places = [np.array(item.position_m) for item in estimate.candidates] or [tip]
-    lines += [
-        _line(title, "candidate" if index else "estimate", place, cluster=str(index))
-        for index, place in enumerate(places)
-    ]
-    along = axis_ends(estimate)
-    if along is not None:
-        lines.append(_line(title, "tool's axis", *along))
-    if estimate.region_mm is not None and estimate.region_axes is not None:
-        semi = np.array(estimate.region_axes) * np.array(estimate.region_mm)[:, None] / 1000
-        lines += [_line(title, "95 % semi-axis", tip, tip + axis, digits=7) for axis in semi]
-    return lines
 
 
 def _payload(
