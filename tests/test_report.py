@@ -339,6 +339,16 @@ def test_every_figure_comes_in_all_forms_with_its_data(folder: Path) -> None:
         assert len(table(place / f"{name}.csv")) >= 1
 
 
+def test_figures_that_were_removed_are_drawn_again(folder: Path, tmp_path: Path) -> None:
+    place = Path(shutil.copytree(folder, tmp_path / "again"))
+    (place / "figures" / "wrist-rays.png").unlink()
+    shutil.rmtree(place / "frames")
+    evaluate([folder.parent / f"{name}.mcap" for name in NAMES], out=place, params=PAPER)
+    assert (place / "figures" / "wrist-rays.png").is_file()
+    frames = {path.name for path in (folder / "frames").iterdir()}
+    assert {path.name for path in (place / "frames").iterdir()} == frames
+
+
 def test_figure_data_are_the_reports(folder: Path, report: EvaluationReport) -> None:
     figures = folder / "figures"
     bars = {row["tool"]: row for row in table(figures / "error-by-tool.csv")}
