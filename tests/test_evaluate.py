@@ -626,6 +626,8 @@ def test_a_change_is_better_worse_or_not_shown(shelf: Path, tmp_path: Path) -> N
         assert tool.after_px is not None
         assert tool.after_px == pytest.approx(scale * tool.before_px, abs=1e-3)
         assert tool.change_px == pytest.approx(tool.after_px - tool.before_px)
+        assert tool.before_mm is not None
+        assert (found.overall.before_mm, found.overall.after_mm) == (tool.before_mm, tool.after_mm)
 
 
 def test_what_cannot_be_paired_is_not_compared(shelf: Path, tmp_path: Path) -> None:

@@ -648,8 +648,8 @@ def tools() -> Iterator[Array]:
 def test_the_mean_of_tools_counts_tools_alike() -> None:
     gathered = MeanOfTools()
     for seed, errors in enumerate(tools()):
-        gathered.add(errors, seed)
-    gathered.add(np.array([np.nan]), 9)
+        gathered.add(errors, str(seed))
+    gathered.add(np.array([np.nan]), "none")
     summary = gathered.summary()
     assert summary is not None
     assert summary.count == 3
@@ -658,6 +658,20 @@ def test_the_mean_of_tools_counts_tools_alike() -> None:
     assert summary.high is not None
     # three independent means of 100 errors with a deviation of 1
     assert summary.high - summary.low == pytest.approx(2 * 1.96 * 0.1 / np.sqrt(3), rel=0.25)
+
+
+def test_the_mean_of_tools_does_not_mind_their_order() -> None:
+    found = list(enumerate(tools()))
+    forwards, backwards = MeanOfTools(), MeanOfTools()
+    for gathered, order in ((forwards, found), (backwards, found[::-1])):
+        for seed, errors in order:
+            gathered.add(errors, str(seed))
+    one, other = forwards.summary(), backwards.summary()
+    assert one is not None
+    assert other is not None
+    assert [one.mean, one.low, one.high] == pytest.approx(
+        [other.mean, other.low, other.high], rel=1e-12
+    )
 
 
 def test_totals_do_not_grow_with_the_recordings(report: EvaluationReport, folder: Path) -> None:

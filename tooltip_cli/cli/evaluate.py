@@ -250,9 +250,13 @@ def print_summary(report: EvaluationReport) -> None:
     click.secho(head, bold=True)
     for row, line in zip(rows, lines, strict=True):
         click.secho(line, fg="yellow" if row[4] else None)
+    said: dict[str, list[str]] = {}
     for found in report.recordings:
         for text in (*(reason.text for reason in found.reasons), *found.notes):
-            say(f"{printable(found.name)}: {text}")
+            said.setdefault(text, []).append(printable(found.name))
+    for text, names in said.items():
+        everywhere = len(names) == len(report.recordings) > 1
+        say(f"{f'all {len(names)} recordings' if everywhere else ', '.join(names)}: {text}")
     click.echo(report.page)
 
 

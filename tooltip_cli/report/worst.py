@@ -51,7 +51,7 @@ def _errors(table: FrameTable) -> tuple[Array, str]:
 
 @styled
 def _over_time(row: RecordingReport, table: FrameTable) -> Drawing:
-    from matplotlib.ticker import NullFormatter
+    from matplotlib.ticker import LogLocator
 
     seconds = (table.stamps_ns - table.stamps_ns[0]) * 1e-9
     labelled = np.isfinite(table.label).all(axis=1).any()
@@ -88,8 +88,8 @@ def _over_time(row: RecordingReport, table: FrameTable) -> Drawing:
             transform=axes.get_xaxis_transform(),
         )
     axes.set_yscale("log")
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.tick_params(axis="y", which="minor", length=2.0, color=MUTED)
+    axes.minorticks_off()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
     axes.set_xlabel("time since the first test frame [s]")
     axes.set_ylabel("error [px]" if labelled else "distance [px]")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
