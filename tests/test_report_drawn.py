@@ -22,6 +22,7 @@ from tooltip_cli.labels.files import TipLabels, read_labels, write_labels
 from tooltip_cli.method.detector import DetectorParams
 from tooltip_cli.method.estimators import EstimatorParams
 from tooltip_cli.report.charts import Chart, Drawing
+from tooltip_cli.report.figures import _medians
 from tooltip_cli.report.scenes import VotedShape
 from tooltip_cli.stages import evaluate as evaluation
 from tooltip_cli.stages.evaluate import evaluate
@@ -162,6 +163,22 @@ def test_lines_of_training_frames(drawn: Drawn) -> None:
             line.get_xydata(), numbers(mine, "frames", "error_px"), atol=HALF
         )
     assert len(rows) == 4
+    median = next(line for line in axes.lines if line.get_label() == "median of the tools")
+    for size, error in median.get_xydata():
+        mine = [row for row in rows if abs(float(row["frames"]) - size) < 3]
+        assert len(mine) == 2
+        assert error == pytest.approx(np.median(numbers(mine, "error_px")), abs=HALF)
+    assert median.get_xdata()[-1] == numbers(rows, "frames").max()
+
+
+def test_the_median_over_tools_reaches_all_of_their_frames() -> None:
+    curves: list[list[tuple[int, float | None]]] = [
+        [(10, 9.0), (100, 4.0), (397, 2.0)],
+        [(10, 7.0), (100, None), (400, 3.0)],
+        [(10, 8.0), (100, 2.0), (400, 4.0)],
+        [(50, 1.0)],
+    ]
+    assert _medians(curves) == [(10.0, 8.0), (398.5, 2.5)]
 
 
 def test_marks_over_time(drawn: Drawn) -> None:

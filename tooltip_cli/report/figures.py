@@ -77,6 +77,26 @@ def _median(histogram: Histogram) -> float:
     return float(histogram.edges_px[int(np.searchsorted(below, histogram.detections / 2))])
 
 
+def _medians(curves: Sequence[Sequence[tuple[int, float | None]]]) -> list[tuple[float, float]]:
+    """Return the median over tools at each number of frames that most of them have.
+
+    All that a tool has is one such number: a few more or less in one recording than in another.
+    """
+    points = [
+        (frames if place < len(curve) - 1 else None, frames, error)
+        for curve in curves
+        for place, (frames, error) in enumerate(curve)
+        if error
+    ]
+    found = []
+    for which in {key for key, *_ in points}:
+        mine = [(frames, error) for key, frames, error in points if key == which]
+        if len(mine) * 2 > len(curves):
+            frames, error = np.median(mine, axis=0)
+            found.append((float(frames), float(error)))
+    return sorted(found)
+
+
 @styled
 def error_by_training(rows: Sequence[RecordingReport]) -> Drawing | None:
     """Mean prediction error against the number of training frames (4.4: are 400 too many?)."""
@@ -97,13 +117,7 @@ def error_by_training(rows: Sequence[RecordingReport]) -> Drawing | None:
         frames, errors = [p[0] for p in points], [np.nan if p[1] is None else p[1] for p in points]
         axes.plot(frames, errors, color=DETECTOR, alpha=0.35, marker="o", markersize=2.5)
     sizes = sorted({point[0] for points in curves.values() for point in points})
-    common = [
-        (size, [p[1] for points in curves.values() for p in points if p[0] == size and p[1]])
-        for size in sizes
-    ]
-    shared = [
-        (size, float(np.median(values))) for size, values in common if len(values) * 2 > len(curves)
-    ]
+    shared = _medians([[(p[0], p[1]) for p in points] for points in curves.values()])
     if len(curves) > 1 and shared:
         axes.plot(
             *zip(*shared, strict=True),
@@ -116,15 +130,17 @@ def error_by_training(rows: Sequence[RecordingReport]) -> Drawing | None:
         axes.plot([], [], **faint, label="each tool")
         chart.legend_above(2)
     axes.set_xscale("log")
-    ticks = [size for size in _TRAINING_TICKS if sizes[0] <= size <= sizes[-1]]
+    ticks = [size for size in _TRAINING_TICKS if sizes[0] <= size <= 1.03 * sizes[-1]]
     axes.set_xticks(ticks, [str(size) for size in ticks])
     known = [p[1] for points in curves.values() for p in points if p[1] is not None]
     if max(known) > _NARROW * min(known):
         axes.set_yscale("log")
+        axes.set_ylabel("mean prediction error [px], log scale")
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     else:  # from zero, so that what hardly changes looks so
         axes.set_ylim(0, 1.1 * max(known))
+        axes.set_ylabel("mean prediction error [px]")
     axes.minorticks_off()
     highest = max(curves, key=lambda name: max(p[1] or 0.0 for p in curves[name]))
     if len(curves) > 1:
@@ -132,12 +148,11 @@ def error_by_training(rows: Sequence[RecordingReport]) -> Drawing | None:
         axes.annotate(
             shortened(highest), at[:2], (3, 4), textcoords="offset points", color=MUTED, fontsize=8
         )
-    axes.set_xlabel("training frames")
-    axes.set_ylabel("mean prediction error [px]")
+    axes.set_xlabel("training frames, log scale")
     bare(axes, "both")
     most = max(point.repeats for row in rows for point in row.training)
     times = "once" if most == 1 else f"up to {most} times"
-    shown = "; ".join(f"{size} frames: {value:.1f}" for size, value in shared)
+    shown = "; ".join(f"{size:g} frames: {value:.1f}" for size, value in shared)
     return chart.drawing(
         "error-by-training",
         "Error by training frames",
