@@ -166,16 +166,22 @@ def _errors(
     row: dict[str, Any] = {"status": found.status, "codes": codes}
     if found.position is None or found.covariance is None:
         return row
-    places = [found.position, *(item.position for item in found.candidates[1:])]
-    if "ambiguous_end" not in codes:
-        places = places[:1]
-    pixels = [_mean_px(place, views, labels) for place in places]
+    ends = [(found.position, found.covariance)]
+    if "ambiguous_end" in codes:
+        ends += [
+            (item.position, item.covariance)
+            for item in found.candidates[1:]
+            if item.covariance is not None
+        ]
+    pixels = [_mean_px(place, views, labels) for place, _ in ends]
     row |= {"px": pixels[0], "nearest_px": min(pixels)}
     if truth is not None:
-        error = found.position - truth
-        millimetres = [float(1000 * np.linalg.norm(place - truth)) for place in places]
-        inside = float(error @ np.linalg.solve(found.covariance, error)) <= CHI2_95
-        row |= {"mm": millimetres[0], "nearest_mm": min(millimetres), "covered": inside}
+        errors = [place - truth for place, _ in ends]
+        millimetres = [float(1000 * np.linalg.norm(error)) for error in errors]
+        nearest = int(np.argmin(millimetres))
+        error, covariance = errors[nearest], ends[nearest][1]
+        inside = float(error @ np.linalg.solve(covariance, error)) <= CHI2_95
+        row |= {"mm": millimetres[0], "nearest_mm": millimetres[nearest], "covered": inside}
     return row
 
 

@@ -44,7 +44,7 @@ def fit_outlines(
         ends: rough ends, within a few centimetres of one another.
         grip: (3,) metres, hand frame; the tool leads away from it.
     """
-    refine = replace(refine, max_move=params.max_move)
+    refine = replace(refine, max_move=params.max_move, point_share=params.point_share)
     centre = np.mean([end.position for end in ends], axis=0)
     near = near_outlines(silhouettes, centre, refine)
     every = max(1, len(near.camera_from_hand) // params.frames_at_first)
@@ -120,13 +120,20 @@ def _at_point(
 ) -> Fit:
     """Go to the one thing that reaches farthest, if it stands alone: a plug's longest pin.
 
-    A flat end's corner reaches farthest as well, but the background does not show beside it.
+    A flat end's corner reaches farthest as well, but the background does not show beside it. How
+    thick the thing is is not known: looked at too widely its neighbours draw the end towards them,
+    too narrowly it shows no sides, so the width with most support is taken.
     """
     step = point_of(near, fit.position, fit.axis, looked_at(radius), refine)
     if step is None:
         return fit
     at = fit.position + step
-    pointed = fit_end(near, at, fit.axis, radius, refine, refine.point_width)
+    tried = [
+        fit_end(near, at, fit.axis, radius, refine, width, widens=False)
+        for width in params.point_widths
+    ]
+    fits = [item for item in tried if item is not None]
+    pointed = max(fits, key=lambda item: item.support(refine), default=None)
     if pointed is None or pointed.agreement(refine) < refine.min_agreement:
         return fit
     aside = fit.position - pointed.position

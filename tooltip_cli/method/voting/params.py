@@ -151,9 +151,12 @@ class OutlineParams:
     rounds_at_first: int = 6
     least_frames: int = 8  # of those, that must show the end
     starts_kept: int = 3  # that are then tried on all frames
+    point_share: float = 0.6  # as in RefineParams; the background beside the point decides
+    # to each side of a point, that are looked at
+    point_widths: tuple[float, ...] = (0.003, 0.0045, 0.006)
     same_place: float = 0.003  # a point nearer to the end's middle than this is the end
-    beside_depth: float = 0.004  # behind a point, where the background shows beside it
-    min_missing_beside: float = 0.25  # share of the images that must show it
+    beside_depth: float = 0.003  # behind a point, where the background shows beside it
+    min_missing_beside: float = 0.12  # share of the images that must show it
     min_agreement: float = 0.5  # of frames, below which moving edges may know better
 
 

@@ -184,6 +184,7 @@ def fit_end(
     end_width: float | None = None,
     steps: int = _SOLVER_STEPS,
     first_round: int = 0,
+    widens: bool = True,
 ) -> Fit | None:
     """Measure and solve until the end stays; None: too few frames, or it went elsewhere.
 
@@ -194,6 +195,7 @@ def fit_end(
         end_width: across, that is looked at about a pointed end; None: an end as any.
         steps: of the solver in each round.
         first_round: later ones look more closely, from a start that is nearly right.
+        widens: whether a pointed end is looked at as far across as what is seen there reaches.
     """
     pixels = near.scale_at(start)
     pointed, width, at = end_width is not None, looked_at(radius), start
@@ -216,7 +218,8 @@ def fit_end(
         at = at + _at_most(step, _MAX_STEP)
         axis = axis + _at_most(turn, _MAX_TURN)
         axis = axis / np.linalg.norm(axis)
-        end_width = _next_width(measured.halves[:, 0], end_width, width, pointed, index, params)
+        if widens:
+            end_width = _next_width(measured.halves[:, 0], end_width, width, pointed, index, params)
         if loss > last_loss:
             continue
         fit = Fit(
