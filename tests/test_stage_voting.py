@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from tests.helpers.cli import Outcome, tooltip
@@ -17,11 +18,14 @@ from tooltip_cli.log.container import LoggedAttachment, iterate
 from tooltip_cli.log.edges import read_edges
 from tooltip_cli.log.recording import Topics, read_recording
 from tooltip_cli.log.views import resolve_rig, resolve_views
+from tooltip_cli.method.rays import sphere_array
+from tooltip_cli.method.voting.estimate import estimate_by_voting
 from tooltip_cli.method.voting.moving import MovingEdges
-from tooltip_cli.method.voting.params import VotingSettings
+from tooltip_cli.method.voting.params import TrustParams, VotingSettings
+from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.rig.rigfile import load_rig
 from tooltip_cli.stages.calibrate import write_rig
-from tooltip_cli.stages.voting import pair_views
+from tooltip_cli.stages.voting import hand_edges, pair_views
 
 
 def simulate(path: Path, frames: int, size: str, motion: str = "sweep") -> Path:
@@ -154,6 +158,41 @@ def test_damaged_edges_are_made_anew_by_one_thread_and_are_the_same(run: Run) ->
     names = ("frames", "partners", "affines", "counts", "pixels", "translations", "covariances")
     for name in names:
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name), name)
+
+
+def shuffled(edges: MovingEdges, seed: int) -> MovingEdges:
+    """Return the same edges and outlines, those of each frame in another order."""
+    rng = np.random.default_rng(seed)
+    silhouettes = edges.silhouettes
+    assert silhouettes is not None
+    edge = np.lexsort((rng.random(len(edges.pixels)), edges.frame_of_edge))
+    point = np.lexsort((rng.random(len(silhouettes.contours)), silhouettes.row_of_point))
+    return replace(
+        edges,
+        pixels=edges.pixels[edge],
+        translations=edges.translations[edge],
+        covariances=edges.covariances[edge],
+        silhouettes=replace(silhouettes, contours=silhouettes.contours[point]),
+    )
+
+
+def test_neither_seed_nor_order_moves_the_tip(first: Run) -> None:
+    recording = read_recording(first.recording, Topics())
+    views = resolve_views(recording, resolve_rig(recording, None))
+    camera = inverse_transform(views.hand_from_camera)
+    spheres = sphere_array([(item.center, item.radius) for item in views.spheres])
+    edges, settings = stored_edges(first), VotingSettings()
+
+    def pixels(moving: MovingEdges, seed: int) -> npt.NDArray[np.float64]:
+        used = replace(settings, trust=TrustParams(seed=seed))
+        found = estimate_by_voting(hand_edges(views, moving, camera, used), spheres, used)
+        assert found.position is not None
+        seen = camera[:, :3, :3] @ found.position + camera[:, :3, 3]
+        return np.asarray(views.camera.project(seen))
+
+    before = pixels(edges, 0)
+    for after in (pixels(edges, 1), pixels(shuffled(edges, 0), 0), pixels(shuffled(edges, 1), 2)):
+        assert np.nanmax(np.linalg.norm(after - before, axis=1)) < 0.1
 
 
 def test_other_labels_are_other_edges(run: Run) -> None:

@@ -42,7 +42,7 @@ def main() -> None:
     cases = [Case(path) for path in arguments.recordings if len(path.suffixes) == 1]
     print(_row("defaults", "", cases, VotingSettings()), flush=True)
     for group, name, value, settings in _variants(arguments.groups):
-        print(_row(f"{group}.{name}", f"{value:g}", cases, settings), flush=True)
+        print(_row(f"{group}.{name}", value, cases, settings), flush=True)
 
 
 class Case:
@@ -86,7 +86,7 @@ class Case:
         return found
 
 
-def _variants(groups: list[str]) -> Iterator[tuple[str, str, float, VotingSettings]]:
+def _variants(groups: list[str]) -> Iterator[tuple[str, str, str, VotingSettings]]:
     settings = VotingSettings()
     for group in groups:
         params: Any = getattr(settings, group)
@@ -95,13 +95,18 @@ def _variants(groups: list[str]) -> Iterator[tuple[str, str, float, VotingSettin
             if field.name in SKIPPED or not value:
                 continue
             for factor in (0.5, 2.0):
-                changed = type(value)(value * factor)
+                if isinstance(value, tuple):
+                    changed: Any = tuple(item * factor for item in value)
+                else:
+                    changed = type(value)(value * factor)
                 if isinstance(value, int) and field.name in ("block", "search"):
                     changed += 1 - changed % 2  # odd
                 if changed == value or not changed:
                     continue
                 varied: Any = replace(params, **{field.name: changed})
-                yield group, field.name, changed, replace(settings, **{group: varied})
+                shown = changed if isinstance(changed, tuple) else (changed,)
+                text = ",".join(f"{item:g}" for item in shown)
+                yield group, field.name, text, replace(settings, **{group: varied})
 
 
 def _row(name: str, value: str, cases: list[Case], settings: VotingSettings) -> str:

@@ -21,6 +21,7 @@ from tooltip_cli.method.voting.sight import NearEdges, near_outlines, point_of
 from tooltip_cli.method.voting.silhouette import HandSilhouettes
 
 _STEPS_AT_FIRST, _STEPS = 2, 8  # of the solver in each round
+_UNLIKE_WIDTH = 0.3  # of the logarithm of the radius
 _CLOSE = 4  # the first round that looks as closely as the last
 
 
@@ -54,10 +55,7 @@ def fit_outlines(
         min_frames=max(refine.min_frames // every, params.least_frames),
     )
     tried = _fits(near.thinned(every), _starts(ends, grip, refine, params), few, _STEPS_AT_FIRST)
-    best = [
-        _Start(fit.position, fit.axis, start.radius) for start, fit in tried[: params.starts_kept]
-    ]
-    fits = _fits(near, best, refine, first_round=_CLOSE)
+    fits = _fits(near, _unlike(tried, params), refine, first_round=_CLOSE)
     if not fits:
         return None
     start, best_fit = fits[0]
@@ -108,6 +106,19 @@ def _fits(
     ]
     found = [(start, fit) for start, fit in fits if fit is not None]
     return sorted(found, key=lambda item: -item[1].support(refine))
+
+
+def _unlike(tried: Sequence[tuple[_Start, Fit]], params: OutlineParams) -> list[_Start]:
+    """Return the first fits of each kind, to go on from: place, or how widely it was looked at."""
+    kept: list[_Start] = []
+    for start, fit in tried:
+        if all(
+            np.linalg.norm(fit.position - other.position) > params.same_place
+            or abs(np.log(start.radius / other.radius)) > _UNLIKE_WIDTH
+            for other in kept
+        ):
+            kept.append(_Start(fit.position, fit.axis, start.radius))
+    return kept[: params.starts_kept]
 
 
 def _at_point(

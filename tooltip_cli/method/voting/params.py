@@ -150,7 +150,7 @@ class OutlineParams:
     frames_at_first: int = 40  # that all starts are tried on
     rounds_at_first: int = 6
     least_frames: int = 8  # of those, that must show the end
-    starts_kept: int = 3  # that are then tried on all frames
+    starts_kept: int = 4  # unlike ones, that are then tried on all frames
     point_share: float = 0.6  # as in RefineParams; the background beside the point decides
     # to each side of a point, that are looked at
     point_widths: tuple[float, ...] = (0.003, 0.0045, 0.006)
