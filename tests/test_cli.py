@@ -30,7 +30,7 @@ from tests.helpers.logs import (
 from tests.helpers.robot import RIG, TIP
 from tooltip_cli import __version__
 from tooltip_cli.cli.main import COMMANDS, main
-from tooltip_cli.cli.options import progress
+from tooltip_cli.cli.options import columns, progress, table
 from tooltip_cli.log import messages
 from tooltip_cli.log.container import LoggedAttachment, iterate
 from tooltip_cli.rig.rigfile import rig_files
@@ -461,3 +461,17 @@ def test_progress_is_silent_for_quick_work(monkeypatch: pytest.MonkeyPatch) -> N
     with progress(3, "work") as advance:
         advance()
     assert terminal.text == ""
+
+
+def test_tables_keep_their_columns_whatever_names_hold() -> None:
+    rows = [("工具 ü", "1.00", "two ends"), ("a\nb\x1b[31m", "12.00", ""), ("e\u0301", "-", "x")]
+    head, *lines = table(("tool", "px", ""), rows, left=1, words=1)
+    assert head == "tool         px"
+    assert "\x1b" not in "".join(lines)
+    ends = [
+        columns(line[: line.index(number) + len(number)])
+        for line, (_, number, _) in zip(lines, rows, strict=True)
+    ]
+    assert ends == [len(head)] * 3
+    assert lines[0].endswith("1.00  two ends")
+    assert lines[1].endswith("12.00")

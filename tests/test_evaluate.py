@@ -209,6 +209,24 @@ def test_a_refused_estimate_has_no_error(shelf: Path) -> None:
     assert row.baseline_px is not None
 
 
+def test_a_baseline_that_is_refused_is_said_to_be(shelf: Path, tmp_path: Path) -> None:
+    """One label is one ray."""
+    stamps, pixels = np.array([stamp_of(LABELLED[0])], dtype=np.int64), labelled_pixels()[:1]
+    path = tmp_path / "wrist.labels.csv"
+    write_labels(path, TipLabels(stamps, pixels, ("visible",), ("me",)))
+    report = evaluate(
+        [shelf / "wrist.mcap"], labels=path, out=tmp_path / "r", params=PAPER, curve=False
+    )
+    row = report.recordings[0]
+    assert row.baseline_px is None
+    assert row.detector_px is not None
+    assert (row.detector_px.count, row.detector_px.low) == (1, None)
+    (note,) = [note for note in row.notes if note.startswith("no baseline")]
+    assert "the labels alone do not give the tip (" in note
+    page = (tmp_path / "r" / "index.html").read_text()
+    assert "No baseline: the labels alone" in page
+
+
 def test_candidates_are_scored_too(shelf: Path) -> None:
     row, _ = measured(shelf, TIP, TIP)
     assert row.detector is not None
@@ -608,6 +626,8 @@ def test_a_change_is_better_worse_or_not_shown(shelf: Path, tmp_path: Path) -> N
         assert tool.after_px is not None
         assert tool.after_px == pytest.approx(scale * tool.before_px, abs=1e-3)
         assert tool.change_px == pytest.approx(tool.after_px - tool.before_px)
+        assert tool.before_mm is not None
+        assert (found.overall.before_mm, found.overall.after_mm) == (tool.before_mm, tool.after_mm)
 
 
 def test_what_cannot_be_paired_is_not_compared(shelf: Path, tmp_path: Path) -> None:

@@ -124,6 +124,11 @@ def test_a_tip_off_by_known_millimetres(folder: Path, shift_mm: tuple[float, ...
     assert row["detector"]["error_px"]["maximum"] == pytest.approx(expected.max(), abs=0.03)
     assert row["shares"]["detection_px"] == pytest.approx(expected.mean(), abs=0.03)
     everywhere(folder, float(expected.mean()), off)
+    page = (folder / "report" / "index.html").read_text()
+    share = row["shares"]["detection_px"]
+    assert f"{share:.1f} px come from detection: they go when labels take the place" in page
+    assert row["shares"]["clock_px"] == 0
+    assert "The clocks have no share" in page
 
 
 def test_labels_off_by_known_pixels(folder: Path) -> None:
@@ -142,6 +147,9 @@ def test_labels_off_by_known_pixels(folder: Path) -> None:
         errors = [float(frame["prediction_error_px"]) for frame in csv.DictReader(file)]
     np.testing.assert_allclose(errors, 5.0, atol=0.05)
     everywhere(folder, 5.0, 0.0)
+    page = (folder / "report" / "index.html").read_text()
+    assert "5.0 px remain for calibration and the labels&#39; own noise" in page
+    assert "the labels alone lie 5.0 px from the true pixel" in page
 
 
 def test_two_annotators_apart_by_known_pixels(folder: Path) -> None:
@@ -172,3 +180,46 @@ def test_stamps_late_by_a_known_time(tmp_path: Path, late_ms: int) -> None:
     put_right = evaluate(tmp_path, "--rig", tmp_path / "rig.yaml")
     assert put_right["shares"]["clock_offset_ms"] == pytest.approx(0.0, abs=0.2)
     assert put_right["baseline"]["error_px"]["mean"] < 0.1
+
+
+def test_known_errors_of_all_kinds_add_up(tmp_path: Path) -> None:
+    """A tip that is off, labels that are off and late stamps: each share is its own."""
+    late, offset = 40_000_000, np.array([3.0, -4.0])
+    parts = wrist_parts(FRAMES)
+    parts["images"] = [image_message(stamp_of(i) + late, jpeg_of(i)) for i in range(FRAMES)]
+    write_log(tmp_path / "wrist.mcap", parts)
+    label(tmp_path / "wrist.labels.csv", np.zeros(2), late)
+    assert tooltip("evaluate", tmp_path / "wrist.mcap", *QUICK).code == 0
+    shutil.rmtree(tmp_path / "report" / "parts")
+    tip = TIP + np.array([0.0, 0.025, 0.0])
+    put(tmp_path, "detections", tip)
+    put(tmp_path, "labels", TIP)
+    late_only = evaluate(tmp_path)
+    # what a late pose of the robot, written out by hand, is off
+    rows = [angles(stamp_of(frame) + late) for frame in LABELLED]
+
+    def pixels(place: Array) -> Array:
+        points = [(camera_from_hand(*row) @ [*place, 1.0])[:3] for row in rows]
+        return CAMERA.project(np.array(points))
+
+    true = true_pixels(FRAMES)[list(LABELLED)]
+    clock = float(np.linalg.norm(pixels(TIP) - true, axis=1).mean())
+    total = float(np.linalg.norm(pixels(tip) - true, axis=1).mean())
+    shares = late_only["shares"]
+    assert shares["total_px"] == pytest.approx(total, abs=0.05)
+    assert shares["clock_px"] == pytest.approx(clock, abs=0.1)
+    assert shares["detection_px"] == pytest.approx(total - clock, abs=0.1)
+    assert shares["calibration_px"] == pytest.approx(0.0, abs=0.1)
+    label(tmp_path / "wrist.labels.csv", offset, late)
+    shutil.rmtree(tmp_path / "report" / "tips")
+    assert tooltip("evaluate", tmp_path / "wrist.mcap", *QUICK).code == 0
+    shutil.rmtree(tmp_path / "report" / "parts")
+    put(tmp_path, "detections", tip)
+    put(tmp_path, "labels", TIP)
+    shares = evaluate(tmp_path)["shares"]
+    total = float(np.linalg.norm(pixels(tip) - true - offset, axis=1).mean())
+    residual = float(np.linalg.norm(pixels(TIP) - true - offset, axis=1).mean())
+    assert shares["total_px"] == pytest.approx(total, abs=0.05)
+    assert shares["detection_px"] == pytest.approx(total - residual, abs=0.05)
+    assert shares["clock_px"] + shares["calibration_px"] == pytest.approx(residual, abs=0.05)
+    assert shares["clock_offset_ms"] == pytest.approx(-40, abs=4)

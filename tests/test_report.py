@@ -339,6 +339,16 @@ def test_every_figure_comes_in_all_forms_with_its_data(folder: Path) -> None:
         assert len(table(place / f"{name}.csv")) >= 1
 
 
+def test_figures_that_were_removed_are_drawn_again(folder: Path, tmp_path: Path) -> None:
+    place = Path(shutil.copytree(folder, tmp_path / "again"))
+    (place / "figures" / "wrist-rays.png").unlink()
+    shutil.rmtree(place / "frames")
+    evaluate([folder.parent / f"{name}.mcap" for name in NAMES], out=place, params=PAPER)
+    assert (place / "figures" / "wrist-rays.png").is_file()
+    frames = {path.name for path in (folder / "frames").iterdir()}
+    assert {path.name for path in (place / "frames").iterdir()} == frames
+
+
 def test_figure_data_are_the_reports(folder: Path, report: EvaluationReport) -> None:
     figures = folder / "figures"
     bars = {row["tool"]: row for row in table(figures / "error-by-tool.csv")}
@@ -638,8 +648,8 @@ def tools() -> Iterator[Array]:
 def test_the_mean_of_tools_counts_tools_alike() -> None:
     gathered = MeanOfTools()
     for seed, errors in enumerate(tools()):
-        gathered.add(errors, seed)
-    gathered.add(np.array([np.nan]), 9)
+        gathered.add(errors, str(seed))
+    gathered.add(np.array([np.nan]), "none")
     summary = gathered.summary()
     assert summary is not None
     assert summary.count == 3
@@ -648,6 +658,20 @@ def test_the_mean_of_tools_counts_tools_alike() -> None:
     assert summary.high is not None
     # three independent means of 100 errors with a deviation of 1
     assert summary.high - summary.low == pytest.approx(2 * 1.96 * 0.1 / np.sqrt(3), rel=0.25)
+
+
+def test_the_mean_of_tools_does_not_mind_their_order() -> None:
+    found = list(enumerate(tools()))
+    forwards, backwards = MeanOfTools(), MeanOfTools()
+    for gathered, order in ((forwards, found), (backwards, found[::-1])):
+        for seed, errors in order:
+            gathered.add(errors, str(seed))
+    one, other = forwards.summary(), backwards.summary()
+    assert one is not None
+    assert other is not None
+    assert [one.mean, one.low, one.high] == pytest.approx(
+        [other.mean, other.low, other.high], rel=1e-12
+    )
 
 
 def test_totals_do_not_grow_with_the_recordings(report: EvaluationReport, folder: Path) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tooltip_cli.cli.options import PATH, json_option, print_json, say
+from tooltip_cli.cli.options import PATH, json_option, print_json, printable, say, table
 
 if TYPE_CHECKING:
     from tooltip_cli.stages.compare import Comparison, Difference
@@ -47,24 +46,16 @@ def _print(comparison: Comparison) -> None:
     header = ("tool", "before [px]", "after [px]", "change [px]", "tip [mm]", "verdict")
     found = [*comparison.tools, *([comparison.overall] if comparison.overall else [])]
     rows = [_cells(item) for item in found]
-    widths = [max(len(row[column]) for row in (header, *rows)) for column in range(len(header))]
-    click.secho(_line(header, widths), bold=True)
-    for item, row in zip(found, rows, strict=True):
-        click.secho(_line(row, widths), fg=_COLORS.get(item.verdict))
+    head, *lines = table(header, rows, left=1, words=1)
+    click.secho(head, bold=True)
+    for item, line in zip(found, lines, strict=True):
+        click.secho(line, fg=_COLORS.get(item.verdict))
     for item in found:
         if item.remark:
-            say(f"{item.name}: {item.remark}")
+            say(f"{printable(item.name)}: {item.remark}")
     for names, which in ((comparison.only_before, "before"), (comparison.only_after, "after")):
         if names:
-            say(f"only {which}: {', '.join(names)}")
-
-
-def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
-    first, *numbers, last = (
-        cell.ljust(width) if column in (0, len(cells) - 1) else cell.rjust(width)
-        for column, (cell, width) in enumerate(zip(cells, widths, strict=True))
-    )
-    return "  ".join((first, *numbers, last)).rstrip()
+            say(f"only {which}: {printable(', '.join(names))}")
 
 
 def _cells(item: Difference) -> tuple[str, ...]:

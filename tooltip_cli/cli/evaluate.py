@@ -16,8 +16,10 @@ from tooltip_cli.cli.options import (
     json_option,
     prefer_option,
     print_json,
+    printable,
     progress,
     say,
+    table,
     topic_options,
     without_results,
 )
@@ -244,21 +246,18 @@ def print_summary(report: EvaluationReport) -> None:
             "",
         )
         rows.append(mean)
-    widths = [max(len(row[column]) for row in (header, *rows)) for column in range(4)]
-    click.secho(_line(header, widths), bold=True)
-    for row in rows:
-        click.secho(_line(row, widths), fg="yellow" if row[4] else None)
+    head, *lines = table(header, rows, left=1, words=1)
+    click.secho(head, bold=True)
+    for row, line in zip(rows, lines, strict=True):
+        click.secho(line, fg="yellow" if row[4] else None)
+    said: dict[str, list[str]] = {}
     for found in report.recordings:
         for text in (*(reason.text for reason in found.reasons), *found.notes):
-            say(f"{found.name}: {text}")
+            said.setdefault(text, []).append(printable(found.name))
+    for text, names in said.items():
+        everywhere = len(names) == len(report.recordings) > 1
+        say(f"{f'all {len(names)} recordings' if everywhere else ', '.join(names)}: {text}")
     click.echo(report.page)
-
-
-def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
-    numbers = "  ".join(
-        cell.rjust(width) for cell, width in zip(cells[1:4], widths[1:], strict=True)
-    )
-    return f"{cells[0].ljust(widths[0])}  {numbers}  {cells[4]}".rstrip()
 
 
 def _cells(row: RecordingReport) -> tuple[str, str, str, str, str]:

@@ -81,8 +81,11 @@ def main(verbose: bool) -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # and decode a gigapixel that a file of a kilobyte claims
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**25))
+    # ours only: gcsfs logs each failed request, and with it what may be a secret
+    handler = logging.StreamHandler(sys.stderr)
+    handler.addFilter(logging.Filter("tooltip_cli"))
     logging.basicConfig(
-        stream=sys.stderr,
+        handlers=[handler],
         level=logging.INFO if verbose else logging.WARNING,
         format="%(levelname)s: %(message)s",
     )

@@ -9,6 +9,7 @@ import re
 import shutil
 import sys
 import time
+import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -165,17 +166,27 @@ def printable(text: str) -> str:
     return "".join(char if char.isprintable() else " " for char in text)
 
 
-def table(heads: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> list[str]:
-    """Return the lines of a table; the first ``left`` columns begin at the left."""
+def table(
+    heads: Sequence[str], rows: Sequence[Sequence[str]], left: int, words: int = 0
+) -> list[str]:
+    """Return the lines of a table; the first ``left`` and the last ``words`` columns hold words,
+    which begin at the left."""
     cells = [[printable(cell) for cell in row] for row in (heads, *rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return [
-        "  ".join(
-            cell.ljust(width) if column < left else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in cells
-    ]
+    widths = [max(map(columns, column)) for column in zip(*cells, strict=True)]
+
+    def padded(at: int, cell: str) -> str:
+        space = " " * (widths[at] - columns(cell))
+        return cell + space if at < left or at >= len(heads) - words else space + cell
+
+    return ["  ".join(padded(at, cell) for at, cell in enumerate(row)).rstrip() for row in cells]
+
+
+def columns(text: str) -> int:
+    """Return how many columns of a terminal a text takes: a Chinese character takes two."""
+    return sum(
+        0 if unicodedata.combining(char) else 1 + (unicodedata.east_asian_width(char) in "WF")
+        for char in text
+    )
 
 
 def say(message: str) -> None:

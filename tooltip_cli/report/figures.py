@@ -6,10 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tooltip_cli.report import words
+from tooltip_cli.report.bars import shortened
 from tooltip_cli.report.charts import (
     DETECTION,
     DETECTOR,
     INK,
+    MUTED,
     Chart,
     Drawing,
     bare,
@@ -20,6 +23,7 @@ from tooltip_cli.report.tables import number
 
 _COARSE_BINS = 30
 _DETAIL_PX = 30
+_NARROW = 8.0  # a smaller ratio of errors needs no logarithmic axis
 _TRAINING_TICKS = (10, 25, 50, 100, 200, 400, 800, 1600)
 
 
@@ -38,11 +42,12 @@ def detection_histogram(report: EvaluationReport) -> Drawing | None:
     whole, close = chart.axes(2, 1)
     width = step * histogram.bin_px
     whole.bar(np.arange(len(coarse)) * width, coarse, width * 0.92, align="edge", color=DETECTION)
+    whole.set_xlim(0, len(coarse) * width)
     whole.set_xlabel(f"detection error [px], bins of {width:g} px")
     close.bar(np.arange(len(detail)), detail, 0.9, align="edge", color=DETECTION)
     close.set_xlim(0, _DETAIL_PX)
     beyond = histogram.detections - int(detail.sum())
-    close.set_xlabel(f"detection error up to {_DETAIL_PX} px ({beyond} detections lie beyond)")
+    close.set_xlabel(f"detection error [px], {beyond} beyond {_DETAIL_PX} px")
     for axes in (whole, close):
         axes.set_ylabel("detections")
         axes.set_ylim(0, max(1.0, 1.05 * axes.dataLim.y1))
@@ -53,8 +58,9 @@ def detection_histogram(report: EvaluationReport) -> Drawing | None:
     return chart.drawing(
         "detection-histogram",
         "Errors of the 2D detections, all tools",
-        f"Histogram of {histogram.detections} detection errors: {near:.0%} are below 10 pixels, "
-        f"the median lies near {median:.0f} pixels, the largest near {len(counts)} pixels.",
+        f"Histogram of {histogram.detections} detection errors: {words.percent(near)} are below "
+        f"10 pixels, the median lies near {median:.0f} pixels, the largest near {len(counts)} "
+        "pixels.",
         "As Figure 7 of the paper: the distance from the motion interest point to the label, in "
         f"every test frame that has both ({histogram.detections} detections of all tools); above "
         "over the whole range, below in detail.",
@@ -69,6 +75,26 @@ def detection_histogram(report: EvaluationReport) -> Drawing | None:
 def _median(histogram: Histogram) -> float:
     below = np.cumsum(histogram.counts)
     return float(histogram.edges_px[int(np.searchsorted(below, histogram.detections / 2))])
+
+
+def _medians(curves: Sequence[Sequence[tuple[int, float | None]]]) -> list[tuple[float, float]]:
+    """Return the median over tools at each number of frames that most of them have.
+
+    All that a tool has is one such number: a few more or less in one recording than in another.
+    """
+    points = [
+        (frames if place < len(curve) - 1 else None, frames, error)
+        for curve in curves
+        for place, (frames, error) in enumerate(curve)
+        if error
+    ]
+    found = []
+    for which in {key for key, *_ in points}:
+        mine = [(frames, error) for key, frames, error in points if key == which]
+        if len(mine) * 2 > len(curves):
+            frames, error = np.median(mine, axis=0)
+            found.append((float(frames), float(error)))
+    return sorted(found)
 
 
 @styled
@@ -91,13 +117,7 @@ def error_by_training(rows: Sequence[RecordingReport]) -> Drawing | None:
         frames, errors = [p[0] for p in points], [np.nan if p[1] is None else p[1] for p in points]
         axes.plot(frames, errors, color=DETECTOR, alpha=0.35, marker="o", markersize=2.5)
     sizes = sorted({point[0] for points in curves.values() for point in points})
-    common = [
-        (size, [p[1] for points in curves.values() for p in points if p[0] == size and p[1]])
-        for size in sizes
-    ]
-    shared = [
-        (size, float(np.median(values))) for size, values in common if len(values) * 2 > len(curves)
-    ]
+    shared = _medians([[(p[0], p[1]) for p in points] for points in curves.values()])
     if len(curves) > 1 and shared:
         axes.plot(
             *zip(*shared, strict=True),
@@ -110,22 +130,33 @@ def error_by_training(rows: Sequence[RecordingReport]) -> Drawing | None:
         axes.plot([], [], **faint, label="each tool")
         chart.legend_above(2)
     axes.set_xscale("log")
-    axes.set_yscale("log")
-    ticks = [size for size in _TRAINING_TICKS if sizes[0] <= size <= sizes[-1]]
+    ticks = [size for size in _TRAINING_TICKS if sizes[0] <= size <= 1.03 * sizes[-1]]
     axes.set_xticks(ticks, [str(size) for size in ticks])
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    known = [p[1] for points in curves.values() for p in points if p[1] is not None]
+    if max(known) > _NARROW * min(known):
+        axes.set_yscale("log")
+        axes.set_ylabel("mean prediction error [px], log scale")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    else:  # from zero, so that what hardly changes looks so
+        axes.set_ylim(0, 1.1 * max(known))
+        axes.set_ylabel("mean prediction error [px]")
     axes.minorticks_off()
-    axes.set_xlabel("training frames")
-    axes.set_ylabel("mean prediction error [px]")
+    highest = max(curves, key=lambda name: max(p[1] or 0.0 for p in curves[name]))
+    if len(curves) > 1:
+        at = next(p for p in curves[highest] if p[1] is not None)
+        axes.annotate(
+            shortened(highest), at[:2], (3, 4), textcoords="offset points", color=MUTED, fontsize=8
+        )
+    axes.set_xlabel("training frames, log scale")
     bare(axes, "both")
     most = max(point.repeats for row in rows for point in row.training)
     times = "once" if most == 1 else f"up to {most} times"
-    words = "; ".join(f"{size} frames: {value:.1f}" for size, value in shared)
+    shown = "; ".join(f"{size:g} frames: {value:.1f}" for size, value in shared)
     return chart.drawing(
         "error-by-training",
         "Error by training frames",
-        f"Line chart of the prediction error in pixels, median over tools: {words}.",
+        f"Line chart of the prediction error in pixels, median over tools: {shown}.",
         f"Each line is a tool. Fewer of the frames that it is estimated from are drawn at random, "
         f"{times} each, and the errors averaged, refused estimates left out. Where a line is flat, "
         "more frames would not help.",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,13 +22,16 @@ class MeanOfTools:
     means: list[float] = field(default_factory=list)
     _interval: MeanInterval = field(default_factory=MeanInterval)
 
-    def add(self, errors: Array, seed: int) -> None:
-        """Add one tool by its frames' errors, in the order of the frames."""
+    def add(self, errors: Array, name: str) -> None:
+        """Add one tool by its frames' errors, in the order of the frames.
+
+        Tools are drawn independently of one another, each by its name, whatever their order.
+        """
         finite = errors[np.isfinite(errors)]
         if not len(finite):
             return
         self.means.append(float(finite.mean()))
-        self._interval.add(finite, seed)
+        self._interval.add(finite, zlib.crc32(name.encode()))
 
     def summary(self) -> ErrorSummary | None:
         """Return statistics over the tools; the interval is that of the mean over these tools."""
@@ -67,9 +71,8 @@ class Totals:
         if row.detector and row.detector.tip_error_mm is not None:
             self._millimetres.append(row.detector.tip_error_mm)
         if row.detector and row.baseline and row.detector.error_px and row.baseline.error_px:
-            seed = len(self._detector.means)  # tools are drawn independently of one another
-            self._detector.add(table.prediction_error_px, seed)
-            self._baseline.add(table.baseline_error_px, seed)
+            self._detector.add(table.prediction_error_px, row.name)
+            self._baseline.add(table.baseline_error_px, row.name)
 
     def overall(self) -> Overall:
         """Return the sums."""
@@ -89,5 +92,5 @@ class Totals:
 def _over_tools(values: list[float]) -> ErrorSummary | None:
     gathered = MeanOfTools()
     for value in values:
-        gathered.add(np.array([value]), 0)
+        gathered.add(np.array([value]), "")
     return gathered.summary()

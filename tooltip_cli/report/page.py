@@ -99,7 +99,7 @@ def _tool_table(report: EvaluationReport, left_out: Sequence[str]) -> str:
                 "",
             ]
         )
-    return grid(
+    table = grid(
         "Mean prediction error of each tool",
         (
             "tool",
@@ -109,9 +109,14 @@ def _tool_table(report: EvaluationReport, left_out: Sequence[str]) -> str:
             "to the true tip [mm]",
             "stated deviation [mm]",
             "between the two [mm]",
-            "frames",
+            "frames scored",
         ),
         table_rows(rows),
+    )
+    return (
+        f'{table}<p class="note">Brackets: 95 % interval of the mean. Stated deviation: the '
+        "estimate's own, along the axis where it is largest. Between the two: from the tip by "
+        "detections to the tip by labels.</p>\n"
     )
 
 

@@ -23,8 +23,10 @@ from tooltip_cli.report.tables import csv_text, number
 
 _GAP_PX = 10  # in the middle of that cross, where circle and dot are
 CROSS_PX = 40  # Figure 5: "measures 40 pixels across for scale"
-_OTHERS = "Green rings: the other candidates, which the data cannot tell apart."
+_OTHERS = "Green rings: the other ends that could be meant."
+_OTHERS_OUTSIDE = "The other ends that could be meant lie outside this view."
 _DOT_PX = 2  # radius of the edges that move
+_RAMP = "from blue (0) over violet, red and orange to pale yellow"
 _COLORS = np.array(  # from slow to fast, BGR; told apart by brightness too
     [[110, 80, 50], [190, 90, 150], [110, 110, 245], [60, 190, 255], [190, 255, 255]], dtype=float
 )
@@ -123,7 +125,7 @@ def _prediction(
         key.append("Circle: the tool's mean error.")
     key += ["Dot: the label."] if np.isfinite(x) else []
     others = _others(row, table, place, scene, 5 * scale)
-    key += [_OTHERS] if others else []
+    key += _others_words(others, window)
     return overlay.drawing(
         f"{row.name}-prediction",
         "Example prediction",
@@ -150,7 +152,7 @@ def _closeup(
     shapes: list[Shape] = []
     for (u, v), color in zip(points, (overlay.WHITE, overlay.GREEN, overlay.BLACK), strict=True):
         if color == overlay.GREEN and np.isfinite(u):
-            shapes += overlay.cross(u, v, 16 * marks, color, 1.6 * marks)
+            shapes += overlay.cross(u, v, 20 * marks, color, 1.6 * marks, gap=9 * marks)
         elif np.isfinite(u):
             shapes.append(Circle(u, v, 3 * marks, color, filled=True))
     others = _others(row, table, place, scene, 5 * marks)
@@ -167,7 +169,7 @@ def _closeup(
                 f"Black: the motion interest point{missing or far}.",
                 *(["White: the label."] if np.isfinite(points[0]).all() else []),
                 *(["Green: the estimate."] if np.isfinite(points[1]).all() else []),
-                *([_OTHERS] if others else []),
+                *_others_words(others, window),
                 "(Figure 1, right, of the paper.)",
             ]
         ),
@@ -180,7 +182,7 @@ def _closeup(
 
 def _others(
     row: RecordingReport, table: FrameTable, place: int, scene: Scene, radius: float
-) -> list[Shape]:
+) -> list[Circle]:
     """Return rings at the other candidates of an estimate with several right answers."""
     if row.detector is None or not row.detector.ambiguous:
         return []
@@ -192,6 +194,13 @@ def _others(
         for u, v in pixels
         if np.isfinite(u)
     ]
+
+
+def _others_words(others: Sequence[Circle], window: Window) -> list[str]:
+    if not others:
+        return []
+    seen = any(_inside(np.array([ring.u, ring.v]), window) for ring in others)
+    return [_OTHERS if seen else _OTHERS_OUTSIDE]
 
 
 def _inside(point: Array, window: Window) -> bool:
@@ -211,7 +220,7 @@ def _edge_map(
     motion = edge_motion(first, second, find_edges(first, scene.detector), scene.detector)
     picture = np.asarray(cv2.cvtColor(first // 3, cv2.COLOR_GRAY2BGR))
     shapes: list[Shape] = []
-    data = "u,v,weight\n"
+    data, colors = "u,v,weight\n", ""
     if isinstance(motion, str):
         words = f"the detector finds no motion to weigh ({motion})"
     else:
@@ -223,23 +232,26 @@ def _edge_map(
         fast = motion.weights[order] > scene.detector.min_weight
         for x, y, color in zip(u[fast], v[fast], _ramp(strength[fast]), strict=True):
             cv2.circle(picture, (int(x), int(y)), _DOT_PX, color.tolist(), -1)
-        u_most, v_most = map(float, motion.edges[order[-1]])
+        u_most, v_most = map(float, motion.edges[np.argmax(motion.weights)])
         shapes = [Circle(u_most, v_most, 9 * picture.shape[1] / 640, overlay.WHITE)]
         heavy = int((motion.weights > scene.detector.min_weight).sum())
         words = (
             f"{heavy} of {len(motion.edges)} edges weigh more than "
             f"{scene.detector.min_weight:g}, the heaviest {motion.weights.max():.1f}"
         )
+        colors = (
+            "An edge's weight is its Mahalanobis distance from the motion of the background; its "
+            f"colour goes {_RAMP} ({most:.1f}). Edges above the threshold are drawn as dots; the "
+            "ring marks the heaviest, the motion interest point (section 3.1)."
+        )
         lines = zip(*motion.edges.T.tolist(), motion.weights.tolist(), strict=True)
-        data += "".join(f"{x},{y},{weight:.3f}\n" for x, y, weight in lines)
+        data += "".join(f"{x},{y},{weight:.6f}\n" for x, y, weight in lines)
     return overlay.drawing(
         f"{row.name}-edges",
         "Weighted edge map",
         f"Edges of frame {frame} of {row.name} coloured by how much they move against the "
         f"background: {words}.",
-        f"Frame {frame}: {words}. Brighter edges move more against the background, measured by "
-        "their Mahalanobis distance, and those above the threshold are dots; the ring marks the "
-        "heaviest, the motion interest point (section 3.1).",
+        f"Frame {frame}: {words}. {colors}",
         picture,
         overlay.whole(picture),
         shapes,
@@ -319,6 +331,6 @@ def _thumbnail(row: RecordingReport, table: FrameTable, place: int, image: Image
     if np.isfinite(x):
         shapes.append(Circle(x, y, 1.6 * marks, overlay.WHITE, filled=True))
     if np.isfinite(u):
-        shapes += overlay.cross(u, v, 9 * marks, overlay.GREEN, marks)
+        shapes += overlay.cross(u, v, 11 * marks, overlay.GREEN, marks, gap=4.5 * marks)
     alt = f"Frame {table.frames[place]} of {row.name} around the tip"
     return overlay.overlay_svg(image, window, shapes, alt, 60, most=200)

@@ -14,6 +14,7 @@ from tooltip_cli.report.model import ErrorShares, EstimateScore, FrameTable, Rec
 from tooltip_cli.report.scenes import by_severity
 
 _STRIP = 8  # the worst frames, shown without opening the table
+_OPTION = re.compile(r"(?<= )--[a-z][^ ]*")  # is not broken at its dashes
 _FILES = {"svg": "SVG", "png": "PNG", "csv": "data"}
 _AUDIT_COLUMNS = (
     "frame",
@@ -93,7 +94,8 @@ def recording_section(
 
 
 def _fact(term: str, text: str) -> str:
-    return f"<div><dt>{escape(term)}</dt><dd>{escape(text)}</dd></div>"
+    whole = _OPTION.sub(r'<span class="option">\g<0></span>', escape(text))
+    return f"<div><dt>{escape(term)}</dt><dd>{whole}</dd></div>"
 
 
 def _facts(row: RecordingReport) -> Iterable[tuple[str, str]]:
@@ -138,7 +140,10 @@ def _candidates(row: RecordingReport, detector: EstimateScore) -> Iterable[tuple
             yield f"End {which}", f"{words.end_words(end)}. To take it: {command}"
     elif len(detector.candidates) > 1:
         first, second = detector.candidates[:2]
-        text = f"support {first.support:.0%}; the next best has {second.support:.0%}"
+        text = (
+            f"support {words.percent(first.support)}; the next best has "
+            f"{words.percent(second.support)}"
+        )
         yield "Candidates", text
 
 

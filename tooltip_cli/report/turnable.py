@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from tooltip_cli.log.views import Views
 from tooltip_cli.method.estimators import EstimatorParams
 from tooltip_cli.method.kmeans import nearest
 from tooltip_cli.method.rays import intersections, plausible, rays_in_hand, sphere_array
-from tooltip_cli.method.types import Array, Indices, Rays, TipPixels
+from tooltip_cli.method.types import Array, Rays, TipPixels
 from tooltip_cli.method.voting.estimate import METHOD as VOTING
 from tooltip_cli.report import words
 from tooltip_cli.report.charts import (
@@ -32,8 +32,8 @@ from tooltip_cli.report.charts import (
     styled,
 )
 from tooltip_cli.report.model import EstimateScore, RecordingReport
+from tooltip_cli.report.ray_panels import COLUMNS, Panel, axis_ends, common_rows, panel_rows
 from tooltip_cli.report.scenes import Scene
-from tooltip_cli.report.tables import number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -49,36 +49,7 @@ CLUSTER_COLORS = (  # told apart by most kinds of colour vision (Okabe and Ito),
     "#8a8a8a",
 )
 _MOST_RAYS, _MOST_POINTS = 160, 600
-_AXIS_M = (0.06, 0.02)  # how far back from a tip its axis is drawn, and how far beyond it
 _SEED = 0  # of which rays and points are shown where there are more
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One cloud of rays and what was made of it; metres, hand frame."""
-
-    title: str
-    starts: Array  # (N, 3) where the rays are drawn from
-    ends: Array  # (N, 3)
-    points: Array  # (M, 3) hypothesised intersections
-    clusters: Indices  # (M,) nearest candidate of each
-    estimate: EstimateScore | None
-    rays: int  # before thinning out
-    hypotheses: int
-    shares: Array | None = None  # (M,) where points are what was voted: frames that agree on each
-    frames: int = 0  # that voted
-
-    @property
-    def words(self) -> str:
-        """What is drawn, with numbers."""
-        if self.shares is not None:
-            return f"{self.title}: {len(self.points)} places, from {self.frames} frames"
-        thinned = (
-            f" ({len(self.starts)} and {len(self.points)} of them drawn)"
-            if len(self.starts) < self.rays or len(self.points) < self.hypotheses
-            else ""
-        )
-        return f"{self.title}: {self.rays} rays, {self.hypotheses} intersections{thinned}"
 
 
 @styled
@@ -110,8 +81,11 @@ def rays_figure(row: RecordingReport, scene: Scene) -> Drawing | None:
         "The tip in the hand frame",
         f"Hand, tool and viewing rays of {row.name} in the hand frame, seen from the side. {text}.",
         f"{words.sentence(text)} {_key(row, shown)}",
-        ("panel", "kind", "cluster", "share", "x1_m", "y1_m", "z1_m", "x2_m", "y2_m", "z2_m"),
-        [line for panel in shown for line in _rows(panel)],
+        COLUMNS,
+        [
+            *common_rows(basis, center, radius, spheres, row),
+            *(line for panel in shown for line in panel_rows(panel)),
+        ],
     )
     payload = json.dumps(_payload(shown, basis, center, radius, spheres, row)).replace("<", "")
     script = f'<script type="application/json">{payload}</script>'
@@ -287,16 +261,6 @@ def shades(shares: Array) -> Array:
     return np.asarray(0.2 + 0.8 * np.clip(shares / max(most, 1e-9), 0.0, 1.0))
 
 
-def axis_ends(score: EstimateScore) -> Array | None:
-    """Return (2, 3) the ends of the line that shows the tool's axis; None: not known."""
-    first = score.candidates[0] if score.candidates else None
-    if first is None or first.axis is None:
-        return None
-    back, beyond = _AXIS_M
-    tip, along = np.array(first.position_m), np.array(first.axis)
-    return np.stack([tip - back * along, tip + beyond * along])
-
-
 def _draw_estimate(axes: Axes, estimate: EstimateScore, flat: Any) -> None:
     along = axis_ends(estimate)
     if along is not None:
@@ -336,42 +300,6 @@ def region_loops(score: EstimateScore, steps: int = 48) -> list[Array]:
         np.array(score.position_m) + np.cos(angle) * axes[i] + np.sin(angle) * axes[j]
         for i, j in pairs
     ]
-
-
-def _rows(panel: Panel) -> list[list[str]]:
-    def cells(*points: Array) -> list[str]:
-        return [f"{value:.5f}" for point in points for value in point]
-
-    rays = [
-        [panel.title, "ray", "", "", *cells(start, end)]
-        for start, end in zip(panel.starts, panel.ends, strict=True)
-    ]
-    kind = "intersection" if panel.shares is None else "voted"
-    points = [
-        [panel.title, kind, str(int(cluster)), "", *cells(point), "", "", ""]
-        for point, cluster in zip(panel.points, panel.clusters, strict=True)
-    ]
-    for line, share in zip(points, [] if panel.shares is None else panel.shares, strict=False):
-        line[2:4] = ["", number(float(share), 3)]
-    estimate = panel.estimate
-    if estimate is None or estimate.position_m is None:
-        return rays + points
-    places = [np.array(item.position_m) for item in estimate.candidates]
-    places = places or [np.array(estimate.position_m)]
-    candidates = [
-        [
-            panel.title,
-            "candidate" if index else "estimate",
-            str(index),
-            "",
-            *cells(place),
-            "",
-            "",
-            "",
-        ]
-        for index, place in enumerate(places)
-    ]
-    return [*rays, *points, *candidates]
 
 
 def _payload(

@@ -162,10 +162,15 @@ def region_words(score: EstimateScore) -> str:
     return f"{text}; the true tip lies outside, so the stated uncertainty is too small"
 
 
+def percent(share: float) -> str:
+    """Return a share as a whole percentage that is not torn from its sign."""
+    return f"{100 * share:.0f}\u00a0%"
+
+
 def end_words(end: CandidateScore) -> str:
     """Say of one of several ends where it is and how good."""
     place = ", ".join(f"{1000 * value:.1f}" for value in end.position_m)
-    text = f"({place}) mm, support {end.support:.0%}"
+    text = f"({place}) mm, support {percent(end.support)}"
     if end.error_px is not None:
         text += f", {end.error_px:.1f} px from the labels"
     if end.tip_error_mm is not None:
@@ -200,7 +205,7 @@ def detection_words(row: RecordingReport) -> str:
     text = f"{found.valid} of {found.pairs} pairs of images" + (f" ({flags})" if flags else "")
     if found.error_px is not None and found.within_10_px is not None:
         text += (
-            f"; {found.within_10_px:.0%} of {found.error_px.count} in test frames lie within "
+            f"; {percent(found.within_10_px)} of {found.error_px.count} in test frames lie within "
             f"10 px of the label, median {found.error_px.median:.0f} px"
         )
     return text

@@ -51,6 +51,8 @@ def _errors(table: FrameTable) -> tuple[Array, str]:
 
 @styled
 def _over_time(row: RecordingReport, table: FrameTable) -> Drawing:
+    from matplotlib.ticker import LogLocator
+
     seconds = (table.stamps_ns - table.stamps_ns[0]) * 1e-9
     labelled = np.isfinite(table.label).all(axis=1).any()
     series = [
@@ -87,18 +89,23 @@ def _over_time(row: RecordingReport, table: FrameTable) -> Drawing:
         )
     axes.set_yscale("log")
     axes.minorticks_off()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
     axes.set_xlabel("time since the first test frame [s]")
     axes.set_ylabel("error [px]" if labelled else "distance [px]")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     bare(axes, "y")
     chart.legend_above(4)
+    key = ["Strokes at the bottom: frames whose label says that the tip is hidden."]
+    key = key if hidden.any() else []
+    if any((errors < _FLOOR_PX).any() for _, errors, *_ in series):
+        key.append(f"Errors below {_FLOOR_PX:g} px are drawn at that height.")
     subject = "Errors" if labelled else "Distances from detection to prediction"
     worst = _worst_stretch(seconds, _errors(table)[0])
     return chart.drawing(
         f"{row.name}-over-time",
         "Error over time",
         f"{subject} of {row.name} in each test frame over {seconds[-1]:.0f} seconds. {worst}",
-        f"{subject} in each test frame. {worst}",
+        " ".join([f"{subject} in each test frame, on a logarithmic axis.", *key, worst]),
         (
             "seconds",
             "detection_px",

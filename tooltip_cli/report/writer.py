@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 from tooltip_cli.log.messages import IMAGE
 from tooltip_cli.log.recording import Recording
@@ -28,10 +30,11 @@ from tooltip_cli.report.tables import (
 from tooltip_cli.report.turnable import rays_figure
 from tooltip_cli.report.worst import worst_figures
 
-VERSION = 4  # of what a section looks like; a change draws all sections anew
+VERSION = 5  # of what a section looks like; a change draws all sections anew
 MOST_SECTIONS = 16  # recordings shown in full: hundreds would make a page that opens for nobody
 MOST_PICTURES = 400  # in the audit tables of the whole page, which keeps it below 10 MB
 _A_RECORDING = (12, 100)  # least and most pictures of one recording
+_LINK = re.compile(r'href="((?:figures|frames)/[^"]+)"')
 Save = Callable[[str, str | bytes], None]
 
 
@@ -63,7 +66,7 @@ class ReportWriter:
         """Write one recording's table, figures and section; return whether they were drawn anew."""
         marker = f"<!-- {row.provenance['key']} {VERSION} {self._pictures} {self._frame} -->"
         section = self._part(row)
-        if _first_line(section) == marker:
+        if self._whole(section, marker):
             return False
         figures = list(_figures(row, table, scene, self._frame))
         for figure in figures:
@@ -75,6 +78,17 @@ class ReportWriter:
         self._save(f"parts/{row.name}.csv", csv_text(FRAME_COLUMNS, frame_rows(row.name, table)))
         self._save(str(section.relative_to(self._directory)), f"{marker}\n{text}")
         return True
+
+    def _whole(self, section: Path, marker: str) -> bool:
+        """Return whether a section is there as it would be drawn, with every file it links to."""
+        try:
+            first, text = section.read_text(encoding="utf-8").split("\n", 1)
+        except (OSError, ValueError):
+            return False
+        links = _LINK.findall(text) if first == marker else ()
+        return first == marker and all(
+            (self._directory / unquote(link)).is_file() for link in links
+        )
 
     def finish(self, report: EvaluationReport) -> None:
         """Write what is about all recordings, and the page."""
@@ -165,11 +179,3 @@ def _as_file(recording: Recording, frame: int, message: Any) -> tuple[bytes, str
             return data, suffix
     image = next(recording.images([frame]))
     return cv2.imencode(".png", image)[1].tobytes(), "png"
-
-
-def _first_line(path: Path) -> str:
-    try:
-        with path.open(encoding="utf-8") as file:
-            return file.readline().rstrip("\n")
-    except (OSError, UnicodeDecodeError):
-        return ""

@@ -126,16 +126,15 @@ def _compare(before: _Loaded, after: _Loaded) -> Comparison:
         errors, label_changed = _pair(before.frames.get(name, {}), after.frames.get(name, {}))
         tools.append(_difference(old[name], new[name], errors, label_changed))
         if tools[-1].verdict != NOT_COMPARED:
-            seed = len(paired.means)  # tools are drawn independently of one another
-            paired.add(errors[:, 1] - errors[:, 0], seed)
+            paired.add(errors[:, 1] - errors[:, 0], name)
             for side, column in zip(sides, errors.T, strict=True):
-                side.add(column, seed)
+                side.add(column, name)
             frames += len(errors)
     return Comparison(
         before=str(before.path),
         after=str(after.path),
         tools=tuple(tools),
-        overall=_overall(paired, sides, frames) if paired.means else None,
+        overall=_overall(paired, sides, frames, tools) if paired.means else None,
         only_before=tuple(name for name in old if name not in new),
         only_after=tuple(name for name in new if name not in old),
     )
@@ -182,7 +181,7 @@ def _difference(
             "; ".join(remarks),
         )
     changes = MeanOfTools()
-    changes.add(errors[:, 1] - errors[:, 0], 0)
+    changes.add(errors[:, 1] - errors[:, 0], before.name)
     summary = changes.summary()
     low, high = (None, None) if summary is None else (summary.low, summary.high)
     return Difference(
@@ -208,11 +207,22 @@ def verdict(low_px: float | None, high_px: float | None) -> str:
 
 
 def _overall(
-    paired: MeanOfTools, sides: tuple[MeanOfTools, MeanOfTools], frames: int
+    paired: MeanOfTools,
+    sides: tuple[MeanOfTools, MeanOfTools],
+    frames: int,
+    tools: Sequence[Difference],
 ) -> Difference | None:
     change, before, after = paired.summary(), sides[0].summary(), sides[1].summary()
     if change is None or before is None or after is None:
         return None
+    compared = [tool for tool in tools if tool.verdict != NOT_COMPARED]
+    known = [
+        (tool.before_mm, tool.after_mm)
+        for tool in compared
+        if tool.before_mm is not None and tool.after_mm is not None
+    ]
+    all_known = len(known) == len(compared)
+    before_mm, after_mm = map(float, np.mean(known, axis=0)) if all_known else (None, None)
     return Difference(
         name=OVERALL,
         frames=frames,
@@ -221,8 +231,8 @@ def _overall(
         change_px=change.mean,
         low_px=change.low,
         high_px=change.high,
-        before_mm=None,
-        after_mm=None,
+        before_mm=before_mm,
+        after_mm=after_mm,
         verdict=verdict(change.low, change.high),
         remark=f"mean of {change.count} tools",
     )

@@ -50,10 +50,10 @@ from tooltip_cli.stages.estimate import (
 )
 from tooltip_cli.stages.held_out import LABELS_SUFFIX
 from tooltip_cli.stages.measure import Case, Labelled, Protocol, measure
-from tooltip_cli.stages.memory import give_back_large_arrays
+from tooltip_cli.stages.memory import give_back_freed, give_back_large_arrays
 from tooltip_cli.stages.shape import Voters, voted_shape
 
-VERSION = 4
+VERSION = 5
 DEFAULT_DIRECTORY = "report"
 _LOGGER = logging.getLogger(__name__)
 
@@ -161,6 +161,7 @@ def evaluate(
         totals.add(done.row, done.table)
         writer.add(done.row, done.table, done.scene)
         del done  # before the next one is read
+        give_back_freed()
     if all(row.status == "failed" for row in rows):
         raise TooltipError(f"none of the {len(rows)} recordings could be evaluated")
     report = EvaluationReport(

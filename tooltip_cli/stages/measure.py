@@ -178,6 +178,10 @@ def _notes(case: Case, without_pose: int) -> tuple[str, ...]:
         )
     if not described.visible:
         notes.append("no label shows the tip, so there is no error in pixels and no baseline")
+    baseline = case.found.get("labels")
+    if baseline is not None and baseline.estimate.position is None:
+        why = "; ".join(reason.text for reason in baseline.estimate.reasons)
+        notes.append(f"no baseline: the labels alone do not give the tip ({why})")
     return tuple(notes)
 
 

@@ -21,6 +21,7 @@ from tooltip_cli.method.voting.volume import HandEdges
 from tooltip_cli.rig.camera import CameraModel
 from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.stages.held_out import unlabelled
+from tooltip_cli.stages.memory import give_back_freed
 from tooltip_cli.stages.moving import (
     DetectedEdges,
     PendingEdges,
@@ -67,6 +68,7 @@ def vote(
     detected = detect_edges_in(
         recording, views, pairing, settings, out=out, jobs=jobs, on_frame=on_frame
     )
+    give_back_freed()  # voting is where the most is held
     edges = hand_edges(views, detected.edges, camera_from_hand, settings)
     spheres = sphere_array([(sphere.center, sphere.radius) for sphere in views.spheres])
     better = put_right(edges, pairing, spheres)

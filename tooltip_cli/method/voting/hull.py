@@ -34,13 +34,19 @@ def visual_hull(
     camera, view = silhouettes.camera_from_hand, silhouettes.view
     masks = _where_the_hand_hides(silhouettes.masks, camera, view, spheres, params)
     cameras = np.ascontiguousarray(view @ camera[:, :3])
-    axis = grid_axis(reach, params.coarse)
-    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    voxels = grid[np.square(grid).sum(axis=1) < reach * reach]
+    voxels = _ball(reach, params.coarse)
     kept, _ = _uncarved(voxels, cameras, masks, params.coarse, params)
     voxels = (voxels[kept][:, None] + params.coarse * _CHILDREN).reshape(-1, 3)
     kept, frames = _uncarved(voxels, cameras, masks, params.fine, params)
     return _pieces(voxels[kept], frames[kept], spheres, params.fine)
+
+
+def _ball(reach: float, step: float) -> Array:
+    """Return (V, 3) the voxels of a ball, without ever holding those of its cube."""
+    axis = grid_axis(reach, step)
+    squares = np.square(axis)
+    inside = squares[:, None, None] + squares[:, None] + squares < reach * reach
+    return axis[np.argwhere(inside)]
 
 
 def missing(silhouettes: HandSilhouettes, points: Array) -> Array:

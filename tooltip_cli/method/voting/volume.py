@@ -85,6 +85,7 @@ def reconstruct(edges: HandEdges, params: VotingParams) -> Cloud:
     positions, scores = _place(edges, points, rows, profiles, depths, volume, params.coarse, params)
     good = scores > params.min_score
     for _ in range(params.rounds):
+        del volume  # 50 MB, before the next one is made
         volume = _recount(positions[good], rows[good], expected, edges.reach, params)
         positions, scores = _place(
             edges, points, rows, profiles, depths, volume, params.fine, params, _SUBSTEPS
@@ -252,11 +253,11 @@ def _recount(
 
     axis = grid_axis(reach, params.fine)
     counts = frames_per_voxel(positions, rows, axis)
-    smooth = ndimage.gaussian_filter(counts, 1.0, truncate=3.0)
+    ndimage.gaussian_filter(counts, 1.0, truncate=3.0, output=counts)  # in place: it is large
     coarse = grid_axis(reach, params.coarse)
     nearest = np.clip(np.round((axis - coarse[0]) / params.coarse), 0, len(coarse) - 1).astype(int)
     due = np.maximum(expected, _FEWEST_EXPECTED)[np.ix_(nearest, nearest, nearest)]
-    return np.asarray(smooth / due, dtype=np.float32)
+    return np.divide(counts, due, out=counts)
 
 
 def frames_per_voxel(positions: Array, rows: Indices, axis: Array) -> Volume:
@@ -278,8 +279,10 @@ def count_frames(
     flat = np.ravel_multi_index(tuple(index[inside].T), shape)
     frames = int(rows.max(initial=0)) + 1
     pairs = np.unique(flat * frames + rows[inside])
-    counts = np.bincount(pairs // frames, minlength=int(np.prod(shape)))
-    return counts.reshape(shape).astype(np.float32)
+    voxels, numbers = np.unique(pairs // frames, return_counts=True)
+    counts = np.zeros(shape, dtype=np.float32)
+    counts.flat[voxels] = numbers
+    return counts
 
 
 def agreed_points(

@@ -7,7 +7,6 @@ provider's tools do, and nothing here takes, passes on, or repeats any.
 from __future__ import annotations
 
 import io
-import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -165,8 +164,6 @@ def _open(where: Remote) -> tuple[Any, str]:
         fsspec.get_filesystem_class(protocol)
     except ImportError:
         raise MissingExtraError(f"{protocol}://", extra, module) from None
-    # gcsfs logs each failure with its traceback, and its request with what may be a secret
-    logging.getLogger(module).setLevel(logging.CRITICAL + 1)
     files, path = fsspec.core.url_to_fs(where.url)
     return files, path
 
