@@ -58,8 +58,8 @@ def fit_outlines(
     fits = _fits(near, _unlike(tried, params), refine, first_round=_CLOSE)
     if not fits:
         return None
-    start, best_fit = fits[0]
-    return _at_point(silhouettes, near, best_fit, start.radius, refine, params)
+    widest = max(start.radius for start, _ in fits)
+    return _at_point(silhouettes, near, fits[0][1], widest, refine, params)
 
 
 def _starts(
@@ -150,7 +150,7 @@ def _at_point(
     aside = fit.position - pointed.position
     aside = aside - (aside @ fit.axis) * fit.axis  # at a corner the other axis leads outwards
     if np.linalg.norm(aside) < params.same_place:
-        return max(fit, pointed, key=lambda item: item.support(refine))
+        return fit
     behind = pointed.position - params.beside_depth * fit.axis
     beside = missing(silhouettes, behind + np.outer([0.5, 1.0], aside))
     return pointed if beside.max() > params.min_missing_beside else fit
