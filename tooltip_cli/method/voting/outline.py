@@ -22,6 +22,7 @@ from tooltip_cli.method.voting.silhouette import HandSilhouettes
 
 _STEPS_AT_FIRST, _STEPS = 2, 8  # of the solver in each round
 _UNLIKE_WIDTH = 0.3  # of the logarithm of the radius
+_AS_GOOD = 0.9  # of the most support
 _CLOSE = 4  # the first round that looks as closely as the last
 
 
@@ -133,7 +134,7 @@ def _at_point(
 
     A flat end's corner reaches farthest as well, but the background does not show beside it. How
     thick the thing is is not known: looked at too widely its neighbours draw the end towards them,
-    too narrowly it shows no sides, so the width with most support is taken.
+    too narrowly it shows no sides, so the narrowest width with nearly the most support is taken.
     """
     step = point_of(near, fit.position, fit.axis, looked_at(radius), refine)
     if step is None:
@@ -143,8 +144,9 @@ def _at_point(
         fit_end(near, at, fit.axis, radius, refine, width, widens=False)
         for width in params.point_widths
     ]
-    fits = [item for item in tried if item is not None]
-    pointed = max(fits, key=lambda item: item.support(refine), default=None)
+    fits = [(item.support(refine), item) for item in tried if item is not None]
+    most = max((support for support, _ in fits), default=0.0)
+    pointed = next((item for support, item in fits if support >= _AS_GOOD * most), None)
     if pointed is None or pointed.agreement(refine) < refine.min_agreement:
         return fit
     aside = fit.position - pointed.position
