@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -62,7 +63,8 @@ def test_a_lost_worker_costs_nothing_but_time(cluster: Cluster, shelf: Path) -> 
     cluster.kill(cluster.workers[0])
     out, err = process.communicate(timeout=120)
     assert process.returncode == 1, err  # the broken recording
-    assert "8 recordings: 7 ok, 0 refused, 1 failed; 0 reused" in out
+    # what the lost worker had finished but not told is reused
+    assert re.search(r"8 recordings: 7 ok, 0 refused, 1 failed; [0-3] reused", out), out
     after = stamps(shelf / "run")
     assert {name: after[name] for name in before} == before  # nothing finished is done twice
     cluster_rows, cluster_files = table(shelf / "run" / "results.csv"), contents(shelf / "run")
