@@ -83,7 +83,7 @@ class EndParams:
     min_frames: float = 6.0  # that agree on a voxel, smoothed over neighbours
     min_share: float = 0.12  # of what the tool's clearest voxels have
     min_voxels: int = 8  # smaller pieces are specks
-    other_end_support: float = 0.65  # nor one with less than this share of the most support
+    other_end_support: float = 0.57  # nor one with less than this share of the most support
     other_end_share: float = 0.8  # another end nearer to the wrist than this share does not count
     end_separation: float = 0.05  # an end is the farthest voxel within this distance
     neighbourhood: float = 0.14  # of the far voxel, that its axis is found from
