@@ -16,13 +16,12 @@ from tooltip_cli.method.types import Array
 from tooltip_cli.method.voting.end import ToolEnd
 from tooltip_cli.method.voting.hull import missing
 from tooltip_cli.method.voting.params import OutlineParams, RefineParams
-from tooltip_cli.method.voting.refine import Fit, fit_end, looked_at, turned_axes
+from tooltip_cli.method.voting.refine import Fit, first_as_good, fit_end, looked_at, turned_axes
 from tooltip_cli.method.voting.sight import NearEdges, near_outlines, point_of
 from tooltip_cli.method.voting.silhouette import HandSilhouettes
 
 _STEPS_AT_FIRST, _STEPS = 2, 8  # of the solver in each round
 _UNLIKE_WIDTH = 0.3  # of the logarithm of the radius
-_AS_GOOD = 0.9  # of the most support
 _CLOSE = 4  # the first round that looks as closely as the last
 
 
@@ -144,9 +143,7 @@ def _at_point(
         fit_end(near, at, fit.axis, radius, refine, width, widens=False)
         for width in params.point_widths
     ]
-    fits = [(item.support(refine), item) for item in tried if item is not None]
-    most = max((support for support, _ in fits), default=0.0)
-    pointed = next((item for support, item in fits if support >= _AS_GOOD * most), None)
+    pointed = first_as_good([(item.support(refine), item) for item in tried if item is not None])
     if pointed is None or pointed.agreement(refine) < refine.min_agreement:
         return fit
     aside = fit.position - pointed.position

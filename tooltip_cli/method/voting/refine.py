@@ -16,6 +16,7 @@ with its body. All is measured again from where the end then is, until it stays.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,7 +43,7 @@ _LEAST_WIDTH = 0.010  # metres across, looked at about the thinnest tools
 _WIDTH_PER_RADIUS, _WIDTH_MARGIN = 1.8, 0.004
 _END_MARGIN = 0.002  # metres beyond the end's sides
 _MAX_STEP, _MAX_TURN = 0.005, 0.2  # metres and radians in one round
-_AS_GOOD = 0.9  # share of the most support that a later round must have
+_AS_GOOD = 0.9  # share of the most support that is nearly the most
 _LOSS_FALLS = 0.6  # by this factor in each round, until it is the last
 _WIDE_ROUNDS = 2  # before the width at the end follows what was measured
 _SETTLED = 5e-5  # metres
@@ -229,8 +230,13 @@ def fit_end(
             fits.append((fit.support(params), fit))
         if np.linalg.norm(step) < _SETTLED:
             break
+    return first_as_good(fits[::-1])
+
+
+def first_as_good(fits: Sequence[tuple[float, Fit]]) -> Fit | None:
+    """Return the first fit that has nearly the most support, given before each; None: no fits."""
     most = max((support for support, _ in fits), default=0.0)
-    return next((fit for support, fit in reversed(fits) if support >= _AS_GOOD * most), None)
+    return next((fit for support, fit in fits if support >= _AS_GOOD * most), None)
 
 
 def _next_width(
