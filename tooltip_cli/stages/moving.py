@@ -148,6 +148,8 @@ def known_edges(
         "hand": digest(np.round(np.column_stack([centres, radii]))),
         "turned": digest(np.round(views.root_from_camera[pairing.frames], 4)),
     }
+    if pairing.levels.any():  # where all are matched whole, as before there were levels
+        parents["levels"] = digest(pairing.levels)
     key = stage_key("edges", VERSION, parents, params)
     if not force:
         for place in known_places(recording.path, SUFFIX, out):
@@ -212,7 +214,10 @@ class FramesJob:
     def part(self, start: int, stop: int) -> _SomeFrames:
         """Return the chosen ones of some images."""
         rows = slice(*np.searchsorted(self._pairing.frames, [start, stop]))
-        return _SomeFrames(self._finder, self._pairing.frames[rows], self._pairing.partners[rows])
+        pairing = self._pairing
+        return _SomeFrames(
+            self._finder, pairing.frames[rows], pairing.partners[rows], pairing.levels[rows]
+        )
 
     def add(self, result: list[FrameEdges]) -> None:
         """Take the edges of some frames."""
@@ -236,14 +241,17 @@ class _Finder:
 
 
 class _SomeFrames:
-    """Some chosen frames (F,) with their partners (F, 2), before and after.
+    """Some chosen frames (F,) with their partners (F, 2), before and after, and levels (F,).
 
     Memory: the images from a frame's first partner to its second.
     """
 
-    def __init__(self, finder: _Finder, frames: Indices, partners: Indices) -> None:
+    def __init__(
+        self, finder: _Finder, frames: Indices, partners: Indices, levels: Indices
+    ) -> None:
         self.wanted = frozenset(map(int, (*frames, *partners.ravel())))
         self._finder, self._frames, self._partners = finder, frames, partners
+        self._levels = levels
         self._centres, self._radii = hand_in_image(finder.views, frames, finder.params.reach)
         self._smoothed: dict[int, Image] = {}
         self._silhouettes: list[FrameSilhouette] = []
@@ -285,6 +293,7 @@ class _SomeFrames:
             float(self._radii[row]),
             self._finder.noise,
             self._finder.params,
+            int(self._levels[row]),
         )
         return replace(edges, silhouette=self._silhouettes[row])
 

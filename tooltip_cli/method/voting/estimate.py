@@ -32,11 +32,12 @@ def check_motion(
         )
     if count >= trust.min_frames:
         return None
-    if pairing.fastest_px > settings.pairing.displacement_px:
+    params = settings.pairing
+    if pairing.fastest_px > params.smallest * params.displacement_px:
         return Reason(
             "too_fast",
             f"a tool's end moves by about {pairing.fastest_px:.0f} pixels between images, and at "
-            f"most {settings.pairing.max_displacement_px:.0f} can be followed, which only "
+            f"most {params.fastest_px:.0f} can be followed, which only "
             f"{count} frames keep to; turn the wrist more slowly, or record at a higher rate",
         )
     return Reason(

@@ -11,10 +11,21 @@ class PairingParams:
 
     frames: int = 200  # at most, spread over the hand's orientations
     probe_radius: float = 0.15  # metres from the hand's origin: where a tool's end is expected
-    displacement_px: float = 4.5  # wanted motion of such points between partners
+    displacement_px: float = 4.5  # wanted motion of such points between partners, whole images
     min_displacement_px: float = 2.0  # less shows nothing
     max_displacement_px: float = 7.0  # more leaves the search window
     max_gap: int = 15  # frames between partners
+    levels: int = 3  # sizes of images, each half the one before, that are matched until it fits
+
+    @property
+    def smallest(self) -> int:
+        """How many times smaller the smallest images are than whole ones."""
+        return int(2 ** (self.levels - 1))
+
+    @property
+    def fastest_px(self) -> float:
+        """Most that such points may move by between neighbouring images."""
+        return self.smallest * self.max_displacement_px
 
 
 @dataclass(frozen=True)
