@@ -212,7 +212,7 @@ def test_other_labels_are_other_edges(run: Run) -> None:
     [
         ("in_plane", 60, "160x120", "depth_unobservable"),
         ("still", 12, "160x120", "no_motion"),
-        ("fast", 8, "640x480", "too_fast"),
+        ("fast", 8, "1280x960", "too_fast"),
     ],
 )
 def test_motion_that_cannot_show_the_tip_is_refused(

@@ -108,7 +108,7 @@ def test_a_hand_that_swings_about_two_axes_shows_the_tip() -> None:
     [
         ("no_motion", swinging(0, 0)),
         ("no_motion", swinging()[:20]),
-        ("too_fast", swinging(speed=30)),
+        ("too_fast", swinging(1.0, 1.0, speed=20)),
         ("depth_unobservable", swinging(0, 0, 1.0)),
         ("depth_unobservable", swinging(0.06, 0.06, 1.0)),
     ],
@@ -117,6 +117,19 @@ def test_motion_that_cannot_show_the_tip(code: str, poses: Array) -> None:
     reason = motion(poses)
     assert reason is not None
     assert reason.code == code
+
+
+def test_what_is_too_fast_is_told_how_fast_it_may_be() -> None:
+    reason = motion(swinging(1.0, 1.0, speed=20))
+    assert reason is not None
+    limit = 4 * SETTINGS.pairing.max_displacement_px
+    assert f"at most {limit:.0f} can be followed, which only 10 frames keep to" in reason.text
+    one_size = replace(SETTINGS, pairing=replace(SETTINGS.pairing, levels=1))
+    poses = swinging(1.0, 1.0, speed=5)
+    slower = check_motion(pair_frames(poses, FOCAL, one_size.pairing), poses, one_size)
+    assert slower is not None
+    assert "at most 7 can be followed" in slower.text
+    assert motion(poses) is None
 
 
 @pytest.fixture(scope="module")

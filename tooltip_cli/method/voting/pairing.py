@@ -147,7 +147,7 @@ def farthest_points(
         chosen.append(last)
         distances = np.minimum(distances, np.linalg.norm(points - points[last], axis=1))
         distances[last] = -1.0  # where all others are the same, none is chosen twice
-    return np.sort(candidates[np.array(chosen)])
+    return np.sort(candidates[np.array(chosen, dtype=np.intp)])
 
 
 def _probe_points(radius: float) -> Array:
