@@ -15,6 +15,7 @@ import pytest
 from tests.helpers.cli import Outcome, tooltip
 from tooltip_cli.labels.files import read_labels
 from tooltip_cli.log.container import LoggedAttachment, iterate
+from tooltip_cli.log.detections import read_provenance
 from tooltip_cli.log.edges import read_edges
 from tooltip_cli.log.images import Image, decode_compressed
 from tooltip_cli.log.recording import Topics, read_recording
@@ -26,6 +27,8 @@ from tooltip_cli.method.voting.params import TrustParams, VotingSettings
 from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.rig.rigfile import load_rig
 from tooltip_cli.stages.calibrate import write_rig
+from tooltip_cli.stages.held_out import unlabelled
+from tooltip_cli.stages.moving import DetectedEdges, known_edges
 from tooltip_cli.stages.voting import hand_edges, pair_views
 
 
@@ -205,6 +208,23 @@ def test_other_labels_are_other_edges(run: Run) -> None:
     assert again.code == 0
     assert f"computed {run.edges_path}" in again.err
     assert f"computed {run.tip_path}" in again.err
+
+
+def test_stored_edges_are_of_their_levels(first: Run) -> None:
+    """Where no image is halved the key is that of files from before any could be."""
+    recording = read_recording(first.recording, Topics())
+    views, settings = resolve_views(recording, resolve_rig(recording, None)), VotingSettings()
+    pairing, _ = pair_views(views, settings, unlabelled(recording, views.camera, None))
+    whole = replace(pairing, levels=np.zeros_like(pairing.levels))
+    halved = replace(pairing, levels=whole.levels + (pairing.frames == pairing.frames[3]))
+    keys = [known_edges(recording, views, some, settings).key for some in (whole, halved)]
+    assert len(set(keys)) == 2
+    origin = read_provenance(first.edges_path)
+    assert origin is not None
+    assert (origin["key"] == keys[0]) == (not pairing.levels.any())
+    found = known_edges(recording, views, pairing, settings)
+    assert isinstance(found, DetectedEdges)
+    assert found.reused
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.test_voting_watching import FOCAL, sweep
-from tooltip_cli.method.types import Array
+from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.online import CausalPairing, Decided, Spread
 from tooltip_cli.method.voting.pairing import farthest_points, pair_frames
 from tooltip_cli.method.voting.params import PairingParams
@@ -103,7 +103,7 @@ def test_equal_points_leave_room_for_others() -> None:
     assert spread_of(kept(np.array([[0.0], [0.0], [0.0], [2.0], [5.0]]), 3)) == 2.0
 
 
-def ranked(points: Array, ranks: Array, capacity: int) -> list[int]:
+def ranked(points: Array, ranks: Indices, capacity: int) -> list[int]:
     spread, rows = Spread(capacity, points.shape[1]), np.full(capacity, -1)
     for row, (point, rank) in enumerate(zip(points, ranks, strict=True)):
         place = spread.place_for(point, int(rank))
@@ -117,12 +117,12 @@ def ranked(points: Array, ranks: Array, capacity: int) -> list[int]:
 @pytest.mark.parametrize("low", [10, 20, 60])
 def test_those_of_a_higher_rank_make_room_and_leave_no_trace(seed: int, low: int) -> None:
     rng = np.random.default_rng(seed)
-    points, ranks = rng.random((100, 2)), rng.permutation(100) >= low
+    points, ranks = rng.random((100, 2)), (rng.permutation(100) >= low).astype(np.intp)
     chosen = ranked(points, 2 * ranks, 20)
     assert len(chosen) == 20
-    lower = np.flatnonzero(~ranks)
+    lower = np.flatnonzero(ranks == 0)
     if low > 20:  # as if the others had never come
-        alone = ranked(points[lower], np.zeros(low), 20)
+        alone = ranked(points[lower], np.zeros(low, dtype=np.intp), 20)
         assert chosen == lower[alone].tolist()
     else:
         assert np.isin(lower, chosen).all()
