@@ -48,6 +48,8 @@ PERTURBATIONS: dict[str, dict[str, Any]] = {
     "tilt+": {"tilt_deg": 40.0},
     "tilt-": {"tilt_deg": -40.0},
     "fast": {"motion": "fast"},
+    "fast15": {"motion": "fast", "fps": 15.0, "frames": 250},
+    "sparse": {"fps": 7.5, "frames": 125, "shutter": 0.1},  # every fourth image of ``none``
     "late": {"time_offset_s": 0.03},
     "clutter": {"background": "clutter"},
     "spheres": {},
