@@ -14,7 +14,7 @@ from tooltip_cli.method.voting.estimate import METHOD, check_motion, estimate_by
 from tooltip_cli.method.voting.moving import MovingEdges
 from tooltip_cli.method.voting.pairing import pair_frames
 from tooltip_cli.method.voting.params import PairingParams, VotingParams, VotingSettings
-from tooltip_cli.method.voting.volume import HandEdges
+from tooltip_cli.method.voting.volume import HandEdges, reconstruct
 
 Array = npt.NDArray[np.float64]
 
@@ -48,10 +48,16 @@ def stick(rng: np.random.Generator, tip: Array, count: int = 60) -> Array:
     return np.asarray(along[:, None] * axis + across)
 
 
-def view(*tips: Array, extent: Array = WIDE, reach: float = REACH, wrong: float = 0.0) -> HandEdges:
+def view(
+    *tips: Array,
+    extent: Array = WIDE,
+    reach: float = REACH,
+    wrong: float = 0.0,
+    speed: float = 1.0,
+) -> HandEdges:
     """Return what is seen of sticks, other points of them in each frame; a share moves anyhow."""
     rng = np.random.default_rng(6)
-    poses = swinging()
+    poses = swinging(speed=speed)
     pairing = pair_frames(poses, FOCAL, SETTINGS.pairing)
     points, moved = [], []
     for frame, partners in zip(pairing.frames, pairing.partners, strict=True):
@@ -228,6 +234,19 @@ def test_a_tool_that_reaches_beyond_the_search_is_refused() -> None:
 def test_edges_that_move_anyhow_are_refused() -> None:
     found = estimate_by_voting(view(TIP, wrong=1.0), SPHERES, SETTINGS)
     assert refusal_of(found) == "inconsistent_views"
+
+
+@pytest.mark.parametrize(("speed", "trusted"), [(1.0, True), (5.0, False)])
+def test_fast_motion_must_be_more_consistent(speed: float, trusted: bool) -> None:
+    edges = view(TIP, wrong=0.3, speed=speed)
+    share = reconstruct(edges, SETTINGS.voting).consistent
+    assert share > SETTINGS.trust.min_consistent
+    for limit, accepted in ((share + 0.05, trusted), (share - 0.05, True)):
+        trust = replace(SETTINGS.trust, fast_consistent=limit)
+        settings = replace(SETTINGS, trust=trust)
+        found = estimate_by_voting(edges, SPHERES, settings)
+        assert (found.status == "ok") == accepted
+        assert accepted or refusal_of(found) == "inconsistent_views"
 
 
 def test_poses_of_other_images_are_refused() -> None:

@@ -196,6 +196,7 @@ class TrustParams:
     min_score: float = 0.6  # best share of expected frames in which a voxel was seen
     min_consistent: float = 0.55  # share of moving edges that fit something fixed to the hand
     convincing_agreement: float = 0.65  # of frames on the end: with it, less may be consistent
+    fast_consistent: float = 0.65  # as min_consistent, with any agreement, where images are halved
     doubtful_agreement: float = 0.6  # of what images show of the end: less is said
     min_in_view: float = 0.5  # share of the frames in which the tip lies inside the image
     halves: int = 6  # random halves of the frames that the end is found from again
