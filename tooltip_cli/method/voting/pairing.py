@@ -11,7 +11,7 @@ from tooltip_cli.method.types import Array, Indices, Mask
 from tooltip_cli.method.voting.params import PairingParams
 
 _ROWS_AT_ONCE = 512  # images whose partners are looked for together; bounds memory
-NONE_KEPT: Indices = np.zeros(0, dtype=np.intp)
+_NONE_KEPT: Indices = np.zeros(0, dtype=np.intp)
 _PROBE_QUANTILE = 0.75  # of the probes' displacements: those on the axis of rotation never move
 
 
@@ -124,7 +124,7 @@ def orientations(camera_from_hand: Array) -> Array:
 
 
 def farthest_points(
-    features: Array, usable: Mask, count: int, kept: Indices = NONE_KEPT
+    features: Array, usable: Mask, count: int, kept: Indices = _NONE_KEPT
 ) -> Indices:
     """Choose rows far from one another (farthest-point sampling), from the first usable one on.
 
