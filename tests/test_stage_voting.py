@@ -124,7 +124,14 @@ def test_edges_lie_in_the_image_and_within_the_search_window(first: Run) -> None
     edges = stored_edges(first)
     assert (edges.counts > 0).mean() > 0.9
     assert edges.pixels.max(axis=0).tolist() < [240, 180]
-    assert np.abs(edges.translations).max() <= VotingSettings().moving.search // 2
+    recording, settings = read_recording(first.recording, Topics()), VotingSettings()
+    views = resolve_views(recording, resolve_rig(recording, None))
+    pairing, _ = pair_views(views, settings, unlabelled(recording, views.camera, None))
+    assert pairing.frames.tolist() == edges.frames.tolist()
+    far, half = np.abs(edges.translations).max(axis=(1, 2)), settings.moving.search // 2
+    scale = 2 ** pairing.levels[edges.frame_of_edge]
+    assert (far <= np.where(scale == 1, half, scale * (half + 1))).all()  # exact to a small pixel
+    assert (far[scale > 1] > half).any()
     assert (edges.partners[:, 0] < edges.frames).all()
     assert (edges.partners[:, 1] > edges.frames).all()
 
