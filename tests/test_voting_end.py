@@ -17,6 +17,7 @@ from tooltip_cli.method.voting.end import (
     end_along,
     far_voxels,
     locate_end,
+    locate_hull_end,
     tool_shape,
 )
 from tooltip_cli.method.voting.params import EndParams
@@ -322,3 +323,11 @@ def test_where_a_tool_stops_along_its_axis() -> None:
         assert place == pytest.approx(-offset, abs=0.001)
     nothing = cloud(np.zeros((0, 3)), np.zeros(0, dtype=int), FRAMES)
     assert end_along(nothing, np.zeros(3), axis, 0.004) == 0
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_an_end_of_a_few_voxels_in_a_line_has_a_width(count: int) -> None:
+    voxels = np.array([[0.0, 0.0, 0.1 + 0.004 * step] for step in range(count)])
+    end = locate_hull_end(Shape(voxels, np.full(count, 9.0)), voxels[-1], HAND, PARAMS)
+    assert end.radius > 0
+    assert np.linalg.norm(end.position - voxels[-1]) < 0.004

@@ -178,6 +178,17 @@ def test_of_two_ends_the_preferred_one_is_given() -> None:
         assert found.reasons == ()
 
 
+def test_an_end_too_short_to_be_named_can_be_preferred() -> None:
+    short = np.array([-0.05, 0.03, 0.05])
+    edges = view(TIP, short)
+    (only,) = estimate_by_voting(edges, SPHERES, SETTINGS).candidates
+    assert np.linalg.norm(only.position - TIP) < 0.005
+    wanted = estimate_by_voting(edges, SPHERES, replace(SETTINGS, prefer=tuple(short)))
+    assert wanted.position is not None
+    assert np.linalg.norm(wanted.position - short) < 0.005
+    assert wanted.reasons == ()
+
+
 def test_a_tip_outside_the_image_is_refused() -> None:
     edges = view(TIP)
     poses = edges.camera_from_hand[edges.moving.frames]

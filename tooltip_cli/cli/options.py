@@ -285,8 +285,8 @@ prefer_option = click.option(
     "--prefer",
     type=Direction(),
     metavar="X,Y,Z",
-    help="Of several ends (ambiguous_end), take the one farthest in this direction, hand frame; "
-    "its position in tip.json will do. For --method voting.",
+    help="Of several ends, named (ambiguous_end) or not, take the one farthest in this direction, "
+    "hand frame; its position in tip.json will do. For --method voting.",
 )
 
 

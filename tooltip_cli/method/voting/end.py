@@ -24,6 +24,7 @@ _BLURS = (1.5, 2.0, 2.5, 3.0)  # bins, standard deviations tried for how blurred
 _NO_SCORE = np.inf
 _BESIDE = 27  # voxels about one, itself among them
 _SOLID_VOXELS = 2000  # of a solid, whose axis is looked for
+_LEAST_RADIUS = 0.001  # metres, of an end
 _MARGIN = 4  # voxels around the points, so that smoothing does not meet the box
 
 
@@ -125,7 +126,7 @@ def locate_end(
     axis = _slender_axis(near, _cone(outwards, params.cone_deg), outwards, params)
     axis = _slender_axis(near, _cone(axis, params.refine_deg), outwards, params)
     middle = far + _middle(near, axis, params.slab_radius, params)
-    radius = float(_scatter(near, axis[:, None], params.short_slab, params.wide).rms[0])
+    radius = _radius(near, axis, params)
     close = np.linalg.norm(cloud.points - middle, axis=1) < params.neighbourhood
     surface, _ = agreed_points(
         cloud.points[close], cloud.frames[close], params.surface_voxel, params.surface_frames
@@ -147,7 +148,7 @@ def locate_hull_end(shape: Shape, far: Array, spheres: Array, params: EndParams)
     axis = _slender_axis(few, _cone(outwards, params.cone_deg), outwards, params)
     axis = _slender_axis(few, _cone(axis, params.refine_deg), outwards, params)
     middle = far + _middle(near, axis, params.slab_radius, params)
-    radius = float(_scatter(few, axis[:, None], params.short_slab, params.wide).rms[0])
+    radius = _radius(few, axis, params)
     about = shape.voxels - middle
     along = about @ axis
     across = np.square(about).sum(axis=1) - along * along
@@ -182,6 +183,12 @@ def _scatter(points: Array, directions: Array, length: float, radius: float) -> 
     variance = np.maximum(total - (second - first * first), 0.0)
     spans = ends - np.where(inside, along, np.inf).min(axis=0)
     return _Slab(np.sqrt(variance), ends, spans, counts)
+
+
+def _radius(near: Array, axis: Array, params: EndParams) -> float:
+    """Return how far the last stretch scatters from the axis, metres; not 0 for lone voxels."""
+    rms = _scatter(near, axis[:, None], params.short_slab, params.wide).rms[0]
+    return max(float(rms), _LEAST_RADIUS)
 
 
 def _slender_axis(near: Array, directions: Array, outwards: Array, params: EndParams) -> Array:

@@ -59,12 +59,24 @@ def find_ends(
     """Return the tool's ends, the farthest from the wrist first; at least one.
 
     An end is also what is farthest from the grip: a tool that is held tilted towards the wrist has
-    its handle's end farther from that than its tip.
+    its handle's end farther from that than its tip. Where a direction says which end is meant, ends
+    that are nearer to both are looked at besides.
 
     Args:
         shape: where the votes say that hand or tool is; not empty.
         spheres: (S, 4) centre and radius of hand and wrist, metres.
     """
+    end = settings.end
+    if settings.prefer is not None:
+        end = replace(end, other_end_support=end.wanted_support, other_end_share=end.wanted_share)
+    ends = _put_right(edges, cloud, shape, spheres, replace(settings, end=end))
+    return _apart(ends, grip_of(spheres), end)
+
+
+def _put_right(
+    edges: HandEdges, cloud: Cloud, shape: Shape, spheres: Array, settings: VotingSettings
+) -> list[FoundEnd]:
+    """Return all rough ends as the images show them."""
     ends: list[FoundEnd] = []
     for rough in _rough_ends(edges, cloud, shape, spheres, settings):
         end = _by_outlines(edges, rough, spheres, settings)
@@ -75,7 +87,7 @@ def find_ends(
             end = by_edges if end is None or by_edges.agreement > end.agreement else end
         if end is not None:
             ends.append(replace(end, by_grip=rough.by_grip))
-    return _apart(ends, grip_of(spheres), settings.end)
+    return ends
 
 
 def _apart(ends: list[FoundEnd], grip: Array, params: EndParams) -> list[FoundEnd]:
@@ -139,11 +151,14 @@ def _rough_ends(
 def _both_ways(shape: Shape, grip: Array, settings: VotingSettings) -> list[tuple[int, bool]]:
     """Return voxels that are far from the wrist, and the one that is farthest from the grip.
 
+    With a preferred direction, all that are far from the grip.
+
     Returns:
         rows, and whether each is there for the grip alone.
     """
     rows = [(int(row), False) for row in far_voxels(shape, settings.end)]
-    for row in far_voxels(shape, settings.end, grip)[:1]:
+    by_grip = far_voxels(shape, settings.end, grip)
+    for row in by_grip if settings.prefer is not None else by_grip[:1]:
         apart = np.linalg.norm(shape.voxels[[at for at, _ in rows]] - shape.voxels[row], axis=1)
         if (apart >= settings.outline.same_end).all():
             rows.append((int(row), True))

@@ -85,6 +85,8 @@ class EndParams:
     min_voxels: int = 8  # smaller pieces are specks
     other_end_support: float = 0.57  # nor one with less than this share of the most support
     other_end_share: float = 0.8  # another end nearer to the wrist than this share does not count
+    wanted_support: float = 0.4  # the same two, where a direction says which end is meant
+    wanted_share: float = 0.4
     end_separation: float = 0.05  # an end is the farthest voxel within this distance
     neighbourhood: float = 0.14  # of the far voxel, that its axis is found from
     short_slab: float = 0.03  # the last stretch, that must be slender
