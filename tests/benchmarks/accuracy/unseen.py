@@ -4,7 +4,7 @@ Example:
     python -m tests.benchmarks.accuracy.unseen --work /tmp/unseen --seeds 11 12
     python -m tests.benchmarks.accuracy.unseen --work /tmp/unseen --perturb tilt- grip- --tools hook
 
-The tools are those of ``unseen_tools.py``; the simulator learns of them for this run alone. The scene
+The tools are those of ``unseen_tools.py``; the simulator learns of them for this run alone. What is
 behind changes with tool and seed. Recordings are made once under ``--work`` and reused.
 """
 
@@ -32,9 +32,7 @@ def main() -> None:
     arguments = parser.parse_args()
     HELD.update(UNSEEN)
     params.TOOLS = (*params.TOOLS, *UNSEEN)
-    cases = simulated(
-        arguments.work, arguments.tools, arguments.seeds, arguments.perturb, scene_of
-    )
+    cases = simulated(arguments.work, arguments.tools, arguments.seeds, arguments.perturb, scene_of)
     score_all(cases, arguments.methods, arguments.work)
 
 

@@ -1,8 +1,8 @@
 """Tools that the product does not have, for ``unseen.py``; see ``sim/tool.py`` for the frame.
 
-The tip is what somebody who labels images would click on: the point of what is pointed, the middle of
-the end face or edge of what is blunt, and where several things reach out, the one that reaches farthest.
-Each builder says why, where that leaves room for doubt.
+The tip is what somebody who labels images would click on: the point of what is pointed, the middle
+of the end face or edge of what is blunt, and where several things reach out, the one that reaches
+farthest. Each builder says which.
 """
 
 from __future__ import annotations
@@ -134,6 +134,7 @@ def spatula(rng: np.random.Generator) -> Tool:
         superellipse(22, 2.5), material=0,
     )  # fmt: skip
     neck = spline([(0.070, 0, 0), (0.095, -0.002, 0), (0.115, -0.010, 0), (0.128, -0.013, 0)], 10)
+    shank = loft(neck, np.full((10, 2), (0.0042, 0.0055)), circle(16), material=0)
     x = np.array([0.122, 0.128, 0.138, 0.150, 0.185, 0.203, 0.206])
     blade = loft(
         np.column_stack([x, -0.011 - 0.12 * (x - 0.122), 0 * x]),
@@ -142,7 +143,7 @@ def spatula(rng: np.random.Generator) -> Tool:
         superellipse(28, 8.0), material=0,
     )  # fmt: skip
     return Tool(
-        merged([handle, loft(neck, np.full((10, 2), (0.0042, 0.0055)), circle(16), material=0), blade]),
+        merged([handle, shank, blade]),
         (plastic(rng, (78, 80, 86), gloss=30.0),),
         np.array([0.206, -0.011 - 0.12 * 0.084, 0.0]),
         _ALONG,
@@ -287,10 +288,11 @@ def mallet(rng: np.random.Generator) -> Tool:
     turn = np.linspace(0.15, np.pi, 14)[:-1]
     ball = np.column_stack([0.172 - 0.020 * np.cos(turn), 0.020 * np.sin(turn)])
     end = 0.020 * (1 + np.cos(turn[-1]))  # what the last ring leaves of the sphere
+    stick = [(-0.075, 0.0045), (0.0, 0.0045), (0.09, 0.0042), (0.158, 0.0040)]
     return Tool(
         merged(
             [
-                revolve([(-0.075, 0.0045), (0.0, 0.0045), (0.09, 0.0042), (0.158, 0.0040)], material=0),
+                revolve(stick, material=0),
                 revolve(ball, material=1, sides=28, tip=float(end)),
             ]
         ),
@@ -421,7 +423,7 @@ def whisk(rng: np.random.Generator) -> Tool:
 def mug(rng: np.random.Generator) -> Tool:
     """Return a full mug held by its handle; the tip is the middle of its mouth.
 
-    Its bottom is as far away, and so is the side that faces away from the hand: a tool without a tip.
+    Its bottom is as far away, and so is the side that faces away from the hand: it has no tip.
     """
     middle, up = 0.068, (0.0, 0.0, 1.0)
     body = loft(
