@@ -56,7 +56,7 @@ from tooltip_cli.stages.moving import DetectedEdges
 from tooltip_cli.stages.voting import vote
 
 SUFFIX = ".tip.json"
-VERSION = 4
+VERSION = 5
 _LOGGER = logging.getLogger(__name__)
 
 
