@@ -10,7 +10,13 @@ import numpy as np
 from tooltip_cli.labels.files import MatchedLabels
 from tooltip_cli.log.recording import Recording
 from tooltip_cli.log.views import Views
-from tooltip_cli.method.detector import Detections, DetectorParams, edge_motion, find_edges
+from tooltip_cli.method.detector import (
+    Detections,
+    DetectorParams,
+    EdgeMotion,
+    edge_motion,
+    find_edges,
+)
 from tooltip_cli.method.estimators import EstimatorParams
 from tooltip_cli.method.evaluation import Split
 from tooltip_cli.method.types import Array
@@ -41,6 +47,17 @@ class VotedShape:
     frames: int  # that it was reconstructed from
 
 
+Weigh = Callable[[int, Image, Image], EdgeMotion | str]
+"""Returns the weighted edge map of an image index, given that image and the next one, both gray."""
+
+
+def all_motion(
+    detector: DetectorParams, frame: int, first: Image, second: Image
+) -> EdgeMotion | str:
+    """Weigh all edges, as the paper does; see `Weigh`."""
+    return edge_motion(first, second, find_edges(first, detector), detector)
+
+
 @dataclass(frozen=True)
 class Scene:
     """A recording with all that its figures are drawn from."""
@@ -49,6 +66,7 @@ class Scene:
     views: Views
     detections: Detections
     detector: DetectorParams
+    weigh: Weigh
     estimator: EstimatorParams
     split: Split
     labels: MatchedLabels | None
@@ -217,7 +235,7 @@ def _edge_map(
 
     frame = int(table.frames[place])
     first, second = (np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)) for image in images)
-    motion = edge_motion(first, second, find_edges(first, scene.detector), scene.detector)
+    motion = scene.weigh(frame, first, second)
     picture = np.asarray(cv2.cvtColor(first // 3, cv2.COLOR_GRAY2BGR))
     shapes: list[Shape] = []
     data, colors = "u,v,weight\n", ""

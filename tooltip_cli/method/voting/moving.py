@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,9 +88,11 @@ def noise_level(pairs: list[tuple[Image, Image]]) -> float:
     Returns:
         Grey levels; at least half of one, which is rounding.
     """
+    import cv2
+
     levels = []
     for first, second in pairs:
-        difference = np.abs(first.astype(np.int16) - second.astype(np.int16))
+        difference = np.asarray(cv2.absdiff(first, second))
         # the median of integers is too coarse at low noise: interpolate its histogram
         share = np.cumsum(np.bincount(difference.ravel(), minlength=2)) / difference.size
         level = int(np.searchsorted(share, 0.5))
@@ -106,6 +109,31 @@ def smooth(image: Image, params: MovingParams) -> Image:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), params.blur_px), dtype=np.uint8)
 
 
+@dataclass(frozen=True)
+class ImageEdges:
+    """The edges of one smoothed image."""
+
+    points: npt.NDArray[np.int32]  # (N, 2) u, v, row by row
+    sample: npt.NDArray[np.int32]  # (S, 2) seeded, in the same order, to fit the background to
+
+
+def canny_thresholds(noise: float, params: MovingParams) -> tuple[int, int]:
+    """Return the thresholds of edges in smoothed images; Canny takes whole numbers.
+
+    Args:
+        noise: of the raw images, grey levels.
+    """
+    low = params.canny_low * max(noise, 1.0)
+    return math.floor(low), math.floor(low * params.canny_ratio)
+
+
+def image_edges(image: Image, thresholds: tuple[int, int], params: MovingParams) -> ImageEdges:
+    """Find the edges of one image (H, W) gray, smoothed."""
+    margin = window_margin(params.block, params.search)
+    points = edge_points(image, *thresholds, margin).copy()  # without the room for more
+    return ImageEdges(points, _sample(points, params))
+
+
 def moving_edges(
     image: Image,
     others: tuple[Image, Image],
@@ -113,6 +141,7 @@ def moving_edges(
     hand_radius_px: float,
     noise: float,
     params: MovingParams,
+    found: ImageEdges | None = None,
 ) -> FrameEdges:
     """Find the edges of one image that move against the background to either partner.
 
@@ -121,10 +150,10 @@ def moving_edges(
         hand_pixel: (2,) where the hand's origin projects.
         hand_radius_px: how far from there the tool can reach.
         noise: of the raw images, grey levels.
+        found: the image's edges, where they are known.
     """
-    low = params.canny_low * max(noise, 1.0)
-    margin = window_margin(params.block, params.search)
-    edges = edge_points(image, low, low * params.canny_ratio, margin)
+    found = found or image_edges(image, canny_thresholds(noise, params), params)
+    edges, sample = found.points, found.sample
     affines = np.full((2, 2, 3), np.nan)
     if len(edges) < _FLAT:
         return _nothing(affines)
@@ -132,15 +161,14 @@ def moving_edges(
     # a mask as an index takes ten times as long with rows of two
     near = np.compress(du * du + dv * dv < hand_radius_px**2, edges, axis=0)
     place = near[:, 1] * image.shape[1] + near[:, 0]  # in all pixels, row by row
-    changed = np.zeros(len(near), dtype=bool)
-    sample = _sample(edges, params)
+    differs = np.zeros(len(near), dtype=bool)
     for side, other in enumerate(others):
         model = _background(image, other, sample, params)
         if model is None:
             return _nothing(affines)
         affines[side] = model
-        changed |= _changed(image, other, model, noise, params).ravel().take(place)
-    edges = np.compress(changed, near, axis=0)
+        differs |= changed(image, other, model, noise, params).ravel().take(place)
+    edges = np.compress(differs, near, axis=0)
     matches = [
         match_blocks(
             image,
@@ -192,10 +220,10 @@ def _background(
     return None if fit is None else fit.model
 
 
-def _changed(
+def changed(
     image: Image, other: Image, model: Array, noise: float, params: MovingParams
 ) -> npt.NDArray[np.bool_]:
-    """Return (H, W) where the images differ after the background's motion is undone."""
+    """Return (H, W) where smoothed images differ after the background's motion is undone."""
     import cv2
 
     height, width = image.shape
