@@ -127,7 +127,7 @@ def test_weights_are_those_of_the_paper_up_to_the_sample() -> None:
     motion = near_motion(shown, seen(second), edges, AT_SLOW, NOISE, PARAMS)
     assert not isinstance(motion, str)
     detector = PARAMS.detector
-    everywhere = detect_tip(shown.gray, second, edges.points, detector)
+    everywhere = detect_tip(shown.gray, second, edges, detector)
     heaviest = motion.edges[np.argmax(motion.weights)]
     assert heaviest.tolist() == everywhere.pixel.tolist()
     assert motion.weights.max() == pytest.approx(everywhere.weight, rel=0.05)

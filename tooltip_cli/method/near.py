@@ -26,7 +26,7 @@ from tooltip_cli.method.detector import (
     not_asked,
 )
 from tooltip_cli.method.types import Array
-from tooltip_cli.method.voting.moving import ImageEdges, changed
+from tooltip_cli.method.voting.moving import changed, within
 from tooltip_cli.method.voting.params import MovingParams
 
 
@@ -35,7 +35,8 @@ class NearParams:
     """Constants of detection near the hand."""
 
     detector: DetectorParams  # but for its Canny
-    moving: MovingParams  # edges, sample and changes are found as moving edges are
+    moving: MovingParams  # edges and changes are found as moving edges are
+    background_edges: int = 500  # about so many, row by row, that the background is fitted to
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Shown:
 def near_motion(
     first: Shown,
     second: Shown,
-    edges: ImageEdges,
+    edges: Edges,
     hand: Array,
     noise: float,
     params: NearParams,
@@ -61,16 +62,17 @@ def near_motion(
     edges and changes are found, so that noise makes up neither.
 
     Args:
-        edges: of ``first``, smoothed.
+        edges: (N, 2) of ``first``, smoothed, row by row.
         hand: (3,) u and v of the hand's origin and how far from there the tool can reach, pixels;
             NaN: it can be anywhere.
         noise: of the images as they were, grey levels.
         lap: told the name of each step when it ends: ``match``, ``fit``, ``changes``.
     """
     detector = params.detector
-    if len(edges.points) < detector.min_edges:
+    if len(edges) < detector.min_edges:
         return FEW_EDGES
-    sample = _with_room(edges.sample, first, params)
+    step = max(len(edges) // params.background_edges, 1)
+    sample = _with_room(np.ascontiguousarray(edges[::step]), first, params)
     matches = _matched(first, second, sample, detector)
     lap("match")
     fit = fit_background(
@@ -84,11 +86,10 @@ def near_motion(
     if fit is None:
         return SINGULAR
     differs = changed(first.smoothed, second.smoothed, fit.model, noise, params.moving)
-    place = edges.points[:, 1] * differs.shape[1] + edges.points[:, 0]  # in all pixels, row by row
-    near = np.compress(differs.ravel().take(place), edges.points, axis=0)
+    place = edges[:, 1] * differs.shape[1] + edges[:, 0]  # in all pixels, row by row
+    near = np.compress(differs.ravel().take(place), edges, axis=0)
     if np.isfinite(hand).all():
-        du, dv = near[:, 0] - hand[0], near[:, 1] - hand[1]
-        near = np.compress(du * du + dv * dv < hand[2] ** 2, near, axis=0)
+        near = within(near, hand[:2], hand[2])
     near = _with_room(near, first, params)
     lap("changes")
     matches = _matched(first, second, near, detector)
@@ -123,7 +124,7 @@ def _with_room(edges: Edges, image: Shown, params: NearParams) -> Edges:
 def detect_near(
     first: Shown,
     second: Shown,
-    edges: ImageEdges,
+    edges: Edges,
     hand: Array,
     noise: float,
     params: NearParams,
@@ -135,5 +136,5 @@ def detect_near(
     """
     motion = near_motion(first, second, edges, hand, noise, params, lap)
     if isinstance(motion, str):
-        return no_detection(motion, len(edges.points))
+        return no_detection(motion, len(edges))
     return heaviest(motion, params.detector)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.log.detections import read_provenance
@@ -19,7 +20,6 @@ from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.moving import (
     FrameEdges,
     Image,
-    ImageEdges,
     MovingEdges,
     canny_thresholds,
     image_edges,
@@ -244,10 +244,10 @@ class Look:
     def __init__(self, gray: Image, params: MovingParams) -> None:
         self.smoothed = smooth(gray, params)
         self._params = params
-        self._edges: dict[tuple[int, int], ImageEdges] = {}
+        self._edges: dict[tuple[int, int], npt.NDArray[np.int32]] = {}
 
-    def edges(self, noise: float) -> ImageEdges:
-        """Return the edges that stand out from so much noise, grey levels."""
+    def edges(self, noise: float) -> npt.NDArray[np.int32]:
+        """Return the edges (N, 2) that stand out from so much noise, grey levels."""
         thresholds = canny_thresholds(noise, self._params)
         if thresholds not in self._edges:
             self._edges[thresholds] = image_edges(self.smoothed, thresholds, self._params)

@@ -109,14 +109,6 @@ def smooth(image: Image, params: MovingParams) -> Image:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), params.blur_px), dtype=np.uint8)
 
 
-@dataclass(frozen=True)
-class ImageEdges:
-    """The edges of one smoothed image."""
-
-    points: npt.NDArray[np.int32]  # (N, 2) u, v, row by row
-    sample: npt.NDArray[np.int32]  # (S, 2) seeded, in the same order, to fit the background to
-
-
 def canny_thresholds(noise: float, params: MovingParams) -> tuple[int, int]:
     """Return the thresholds of edges in smoothed images; Canny takes whole numbers.
 
@@ -127,11 +119,12 @@ def canny_thresholds(noise: float, params: MovingParams) -> tuple[int, int]:
     return math.floor(low), math.floor(low * params.canny_ratio)
 
 
-def image_edges(image: Image, thresholds: tuple[int, int], params: MovingParams) -> ImageEdges:
-    """Find the edges of one image (H, W) gray, smoothed."""
+def image_edges(
+    image: Image, thresholds: tuple[int, int], params: MovingParams
+) -> npt.NDArray[np.int32]:
+    """Find the edges of one image (H, W) gray, smoothed; (N, 2) u, v, row by row."""
     margin = window_margin(params.block, params.search)
-    points = edge_points(image, *thresholds, margin).copy()  # without the room for more
-    return ImageEdges(points, _sample(points, params))
+    return np.array(edge_points(image, *thresholds, margin))  # without the room for more
 
 
 def moving_edges(
@@ -141,7 +134,7 @@ def moving_edges(
     hand_radius_px: float,
     noise: float,
     params: MovingParams,
-    found: ImageEdges | None = None,
+    edges: npt.NDArray[np.int32] | None = None,
 ) -> FrameEdges:
     """Find the edges of one image that move against the background to either partner.
 
@@ -150,25 +143,24 @@ def moving_edges(
         hand_pixel: (2,) where the hand's origin projects.
         hand_radius_px: how far from there the tool can reach.
         noise: of the raw images, grey levels.
-        found: the image's edges, where they are known.
+        edges: (N, 2) u, v, where they are known, see `image_edges`.
     """
-    found = found or image_edges(image, canny_thresholds(noise, params), params)
-    edges, sample = found.points, found.sample
+    if edges is None:
+        edges = image_edges(image, canny_thresholds(noise, params), params)
     affines = np.full((2, 2, 3), np.nan)
     if len(edges) < _FLAT:
         return _nothing(affines)
-    du, dv = edges[:, 0] - hand_pixel[0], edges[:, 1] - hand_pixel[1]
-    # a mask as an index takes ten times as long with rows of two
-    near = np.compress(du * du + dv * dv < hand_radius_px**2, edges, axis=0)
-    place = near[:, 1] * image.shape[1] + near[:, 0]  # in all pixels, row by row
-    differs = np.zeros(len(near), dtype=bool)
+    place = edges[:, 1] * image.shape[1] + edges[:, 0]  # in all pixels, row by row
+    differs = np.zeros(len(edges), dtype=bool)
+    sample = _sample(edges, params)
     for side, other in enumerate(others):
         model = _background(image, other, sample, params)
         if model is None:
             return _nothing(affines)
         affines[side] = model
         differs |= changed(image, other, model, noise, params).ravel().take(place)
-    edges = np.compress(differs, near, axis=0)
+    # a mask as an index takes ten times as long with rows of two
+    edges = within(np.compress(differs, edges, axis=0), hand_pixel, hand_radius_px)
     matches = [
         match_blocks(
             image,
@@ -192,6 +184,12 @@ def moving_edges(
         np.stack([match.translations[moving] for match in matches], axis=1).astype(np.int8),
         np.stack([match.covariances[moving] for match in matches], axis=1).astype(np.float32),
     )
+
+
+def within(edges: npt.NDArray[np.int32], pixel: Array, radius_px: float) -> npt.NDArray[np.int32]:
+    """Return the edges (N, 2) that are less than so far from a pixel (2,)."""
+    du, dv = edges[:, 0] - pixel[0], edges[:, 1] - pixel[1]
+    return np.compress(du * du + dv * dv < radius_px**2, edges, axis=0)
 
 
 def _sample(edges: npt.NDArray[np.int32], params: MovingParams) -> npt.NDArray[np.int32]:
