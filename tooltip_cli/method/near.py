@@ -26,7 +26,7 @@ from tooltip_cli.method.detector import (
     not_asked,
 )
 from tooltip_cli.method.types import Array
-from tooltip_cli.method.voting.moving import changed, within
+from tooltip_cli.method.voting.moving import changed, on_mask, within
 from tooltip_cli.method.voting.params import MovingParams
 
 
@@ -86,8 +86,7 @@ def near_motion(
     if fit is None:
         return SINGULAR
     differs = changed(first.smoothed, second.smoothed, fit.model, noise, params.moving)
-    place = edges[:, 1] * differs.shape[1] + edges[:, 0]  # in all pixels, row by row
-    near = np.compress(differs.ravel().take(place), edges, axis=0)
+    near = on_mask(differs, edges)
     if np.isfinite(hand).all():
         near = within(near, hand[:2], hand[2])
     near = _with_room(near, first, params)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from tooltip_cli.method.affine import fit_background, mahalanobis
 from tooltip_cli.method.blocks import match_blocks, window_margin
 from tooltip_cli.method.canny import edge_points
-from tooltip_cli.method.types import Array, Indices
+from tooltip_cli.method.types import Array, Indices, Mask
 from tooltip_cli.method.voting.params import MovingParams
 from tooltip_cli.method.voting.silhouette import FrameSilhouette, Silhouettes, join_silhouettes
 
@@ -150,17 +150,15 @@ def moving_edges(
     affines = np.full((2, 2, 3), np.nan)
     if len(edges) < _FLAT:
         return _nothing(affines)
-    place = edges[:, 1] * image.shape[1] + edges[:, 0]  # in all pixels, row by row
-    differs = np.zeros(len(edges), dtype=bool)
+    differs = np.zeros(image.shape, dtype=bool)
     sample = _sample(edges, params)
     for side, other in enumerate(others):
         model = _background(image, other, sample, params)
         if model is None:
             return _nothing(affines)
         affines[side] = model
-        differs |= changed(image, other, model, noise, params).ravel().take(place)
-    # a mask as an index takes ten times as long with rows of two
-    edges = within(np.compress(differs, edges, axis=0), hand_pixel, hand_radius_px)
+        differs |= changed(image, other, model, noise, params)
+    edges = within(on_mask(differs, edges), hand_pixel, hand_radius_px)
     matches = [
         match_blocks(
             image,
@@ -184,6 +182,13 @@ def moving_edges(
         np.stack([match.translations[moving] for match in matches], axis=1).astype(np.int8),
         np.stack([match.covariances[moving] for match in matches], axis=1).astype(np.float32),
     )
+
+
+def on_mask(mask: Mask, edges: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Return the edges (N, 2) at which a mask (H, W) is true."""
+    place = edges[:, 1] * mask.shape[1] + edges[:, 0]  # in all pixels, row by row
+    # a mask as an index takes ten times as long with rows of two
+    return np.compress(mask.ravel().take(place), edges, axis=0)
 
 
 def within(edges: npt.NDArray[np.int32], pixel: Array, radius_px: float) -> npt.NDArray[np.int32]:
