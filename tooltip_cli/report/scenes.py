@@ -66,6 +66,7 @@ class Scene:
     views: Views
     detections: Detections
     detector: DetectorParams
+    preset: str  # voting or paper, as in `stages.evaluate`
     weigh: Weigh
     estimator: EstimatorParams
     split: Split
@@ -262,6 +263,8 @@ def _edge_map(
             f"colour goes {_RAMP} ({most:.1f}). Edges above the threshold are drawn as dots; the "
             "ring marks the heaviest, the motion interest point (section 3.1)."
         )
+        if scene.preset != "paper":
+            colors += " Edges that the tool cannot reach, or where nothing changed, are left out."
         lines = zip(*motion.edges.T.tolist(), motion.weights.tolist(), strict=True)
         data += "".join(f"{x},{y},{weight:.6f}\n" for x, y, weight in lines)
     return overlay.drawing(

@@ -253,6 +253,7 @@ def evaluate_recording(
         views,
         detected.detections,
         protocol.detector,
+        protocol.preset,
         near.motion if near else partial(all_motion, protocol.detector),
         protocol.params,
         split,

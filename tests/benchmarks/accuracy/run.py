@@ -9,7 +9,7 @@ Example:
 Simulated recordings are made once under ``--work`` and reused. A given recording needs
 STEM.labels.csv and, where it does not carry them, STEM.rig.yaml and STEM.truth.json beside it.
 ``voting+time`` and ``voting+all`` are voting with ``--refine``; the tip is then projected by the
-refined rig. ``--wrong`` makes every rig wrong: 1 degree, 5 mm and 30 ms.
+refined rig. ``--preset`` is of the detections that ``kmeans`` and ``map`` take. ``--wrong`` makes every rig wrong: 1 degree, 5 mm and 30 ms.
 """
 
 from __future__ import annotations
@@ -67,6 +67,7 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--perturb", nargs="+", default=["none"], choices=list(PERTURBATIONS))
     parser.add_argument("--methods", nargs="+", default=["voting", "kmeans"])
+    parser.add_argument("--preset", default="voting", choices=["voting", "paper"])
     parser.add_argument("--wrong", action="store_true", help="make every rig wrong")
     parser.add_argument("--recordings", nargs="*", type=Path, default=[])
     arguments = parser.parse_args()
@@ -78,7 +79,7 @@ def main() -> None:
     for path, rig, group in cases:
         out = arguments.work / "results"
         smaller = SMALLER_SPHERES_M if group == "spheres" else 0.0
-        for row in _score(path, rig, arguments.methods, out, arguments.wrong, smaller):
+        for row in _score(path, rig, arguments, out, smaller):
             rows.append({"group": group, **row})
             print(_line(rows[-1]), flush=True)
     (arguments.work / "accuracy.json").write_text(json.dumps(rows, indent=1))
@@ -109,16 +110,15 @@ def _simulated(arguments: argparse.Namespace) -> Any:
 def _score(
     path: Path,
     rig_path: Path | None,
-    methods: list[str],
+    arguments: argparse.Namespace,
     out: Path,
-    wrong: bool,
     smaller: float,
 ) -> list[dict[str, Any]]:
     recording = read_recording(path)
     rig = resolve_rig(recording, rig_path)
     spheres = [replace(item, radius=item.radius - smaller) for item in rig.spheres]
     rig = replace(rig, spheres=tuple(spheres))
-    if wrong:
+    if arguments.wrong:
         rig = put_right(recording, rig, WRONG)
     views = resolve_views(recording, rig)
     labels = match_labels(
@@ -131,7 +131,7 @@ def _score(
     rows = [
         {"name": path.stem, "method": "labels", **_errors(baseline, views, labels.visible, truth)}
     ]
-    for method in methods:
+    for method in arguments.methods:
         start = time.perf_counter()
         name, _, what = method.partition("+")
         found = estimate_from_images(
@@ -139,6 +139,7 @@ def _score(
             views,
             EstimatorParams(method=name),
             unlabelled(recording, views.camera, None),
+            preset=arguments.preset,
             refine=(rig, what) if what else None,
             out=out / method,
             force=True,
