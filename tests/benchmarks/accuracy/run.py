@@ -9,7 +9,8 @@ Example:
 Simulated recordings are made once under ``--work`` and reused. A given recording needs
 STEM.labels.csv and, where it does not carry them, STEM.rig.yaml and STEM.truth.json beside it.
 ``voting+time`` and ``voting+all`` are voting with ``--refine``; the tip is then projected by the
-refined rig. ``--preset`` is of the detections that ``kmeans`` and ``map`` take. ``--wrong`` makes every rig wrong: 1 degree, 5 mm and 30 ms.
+refined rig. ``--preset`` is of the detections that ``kmeans`` and ``map`` take. ``--wrong`` makes
+every rig wrong: 1 degree, 5 mm and 30 ms.
 """
 
 from __future__ import annotations
