@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from tests.helpers.cli import tooltip
-from tests.helpers.logs import Log, wrist_parts, write_log
+from tests.helpers.logs import Log, wrist_parts, write_log, write_true_labels
 from tooltip_cli.log.detections import read_detections
 from tooltip_cli.log.recording import Recording, read_recording
 from tooltip_cli.log.views import Views, resolve_rig, resolve_views
@@ -28,7 +28,7 @@ from tooltip_cli.method.detector import (
 from tooltip_cli.method.near import NearParams, Shown, detect_near, near_motion
 from tooltip_cli.method.voting.moving import canny_thresholds, image_edges, smooth
 from tooltip_cli.method.voting.params import MovingParams
-from tooltip_cli.stages.detect import detect_in
+from tooltip_cli.stages.detect import detect, detect_in
 from tooltip_cli.stages.near import near_hand
 
 Image = npt.NDArray[np.uint8]
@@ -235,3 +235,19 @@ def test_a_hand_that_stands_still_is_looked_at_all_the_same(wrist: Log) -> None:
     hand = near_hand(recording, still)
     assert (np.diff(hand.noise_frames) == 1).all()
     assert 0.5 <= hand.noise < 3.0
+
+
+def test_a_frame_in_which_nothing_changed_is_shown_in_the_report(
+    wrist: Log, tmp_path: Path
+) -> None:
+    found = detect(wrist.path, preset="voting").detections
+    (still,) = np.flatnonzero(found.edges == 0)  # where the wrist turns back
+    write_true_labels(wrist.labels, range(0, wrist.frames, 4))
+    assert not still % 4
+    out = ("--out", tmp_path, "--frame", still, "--no-curve")
+    shown = tooltip("evaluate", wrist.path, "--method", "kmeans", *out)
+    assert shown.code == 0, shown.err
+    page = (tmp_path / "index.html").read_text()
+    assert f"Frame {still}: the detector finds no motion to weigh (no_motion)" in page
+    rows = (tmp_path / "figures" / "wrist-edges.csv").read_text().splitlines()
+    assert rows == ["u,v,weight"]

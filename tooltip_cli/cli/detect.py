@@ -75,9 +75,7 @@ def detect(
     """
     from tooltip_cli.log.recording import Topics
     from tooltip_cli.stages.clock import measuring
-    from tooltip_cli.stages.detect import load_ahead
 
-    load_ahead(jobs)
     results: list[dict[str, Any]] = []
     topics = Topics(image=image, joints=joints, info=info, pose=pose)
     check_names(recordings, out)

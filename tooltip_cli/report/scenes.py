@@ -11,6 +11,7 @@ from tooltip_cli.labels.files import MatchedLabels
 from tooltip_cli.log.recording import Recording
 from tooltip_cli.log.views import Views
 from tooltip_cli.method.detector import (
+    NO_MOTION,
     Detections,
     DetectorParams,
     EdgeMotion,
@@ -237,6 +238,8 @@ def _edge_map(
     frame = int(table.frames[place])
     first, second = (np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)) for image in images)
     motion = scene.weigh(frame, first, second)
+    if not isinstance(motion, str) and not len(motion.edges):
+        motion = NO_MOTION
     picture = np.asarray(cv2.cvtColor(first // 3, cv2.COLOR_GRAY2BGR))
     shapes: list[Shape] = []
     data, colors = "u,v,weight\n", ""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,23 +48,6 @@ class Detected:
     key: str
     reused: bool
     detections: Detections
-
-
-def load_ahead(jobs: int) -> None:
-    """Load what looking at images takes while the log is read, where threads may share the work.
-
-    Both take a tenth of a second, and most of reading is left to the system and to libraries.
-    """
-
-    def load() -> None:
-        import cv2
-
-        params = DetectorParams()
-        image = np.asarray(cv2.resize(np.eye(8, dtype=np.uint8) * np.uint8(255), (64, 64)))
-        detect_tip(image, image, find_edges(image, params), params)
-
-    if jobs > 1:
-        threading.Thread(target=load).start()
 
 
 def detection_key(recording: Recording, params: DetectorParams) -> str:
