@@ -232,6 +232,17 @@ def test_it_is_said_when_the_images_agree_little() -> None:
     assert "--refine all" in found.reasons[0].text
 
 
+def test_it_is_said_when_the_end_is_uncertain() -> None:
+    demanding = replace(SETTINGS, trust=replace(SETTINGS.trust, doubtful_std=1e-5))
+    found = estimate_by_voting(view(TIP), SPHERES, demanding)
+    assert found.status == "ok"
+    (reason,) = found.reasons
+    assert reason.code == "uncertain_end"
+    assert found.covariance is not None
+    std = 1000 * np.linalg.eigvalsh(found.covariance)[-1] ** 0.5
+    assert f"{std:.0f} mm" in reason.text
+
+
 def test_no_edges_are_refused() -> None:
     edges = view(TIP)
     empty = replace(

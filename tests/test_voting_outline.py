@@ -8,7 +8,12 @@ import numpy.typing as npt
 import pytest
 
 from tests.helpers.scenes import FOCAL, poses_of
-from tooltip_cli.method.voting.end import ToolEnd, far_voxels, locate_hull_end
+from tooltip_cli.method.voting.end import (
+    ToolEnd,
+    far_voxels,
+    locate_far_side,
+    locate_hull_end,
+)
 from tooltip_cli.method.voting.hull import missing, visual_hull
 from tooltip_cli.method.voting.outline import fit_outlines
 from tooltip_cli.method.voting.params import EndParams, HullParams, OutlineParams, RefineParams
@@ -39,16 +44,23 @@ def points_of(bar: Bar) -> Array:
     return np.concatenate([end + rim, end - length * axis + rim])
 
 
-def seen(bars: list[Bar], seed: int = 0, noise_px: float = 0.2) -> HandSilhouettes:
-    """Return exact silhouettes of convex bars, their outlines with noise."""
+def ball(centre: Array, radius: float) -> Array:
+    """Return (P, 3) points on the surface of a ball."""
+    points = np.random.default_rng(0).normal(size=(2000, 3))
+    return np.asarray(centre + radius * points / np.linalg.norm(points, axis=1, keepdims=True))
+
+
+def seen(solids: list[Bar | Array], seed: int = 0, noise_px: float = 0.2) -> HandSilhouettes:
+    """Return exact silhouettes of bars and of convex points, their outlines with noise."""
     rng = np.random.default_rng(seed)
     poses = poses_of(rng.uniform(-0.9, 0.9, (FRAMES, 3)))
     masks = np.full((FRAMES, SIZE[1], SIZE[0]), BACKGROUND, np.uint8)
     points, rows = [], []
     for row, pose in enumerate(poses):
         hulls = []
-        for bar in bars:
-            camera = points_of(bar) @ pose[:3, :3].T + pose[:3, 3]
+        for solid in solids:
+            surface = solid if isinstance(solid, np.ndarray) else points_of(solid)
+            camera = surface @ pose[:3, :3].T + pose[:3, 3]
             pixels = (camera @ VIEW.T)[:, :2] / camera[:, 2:]
             hull = cv2.convexHull(pixels.astype(np.float32))[:, 0]
             fine = np.round(hull * 16).astype(np.int32)
@@ -90,7 +102,7 @@ def start(step: float, turn_deg: float, radius: float, seed: int = 3) -> ToolEnd
 def fitted(silhouettes: HandSilhouettes, *starts: ToolEnd) -> Fit:
     found = fit_outlines(silhouettes, starts, GRIP, REFINE, OUTLINE)
     assert found is not None
-    return found
+    return found[0]
 
 
 @pytest.mark.parametrize("radius", [0.004, 0.01, 0.025])
@@ -183,3 +195,36 @@ def test_the_corner_of_a_blade_is_not() -> None:
     blade = (TIP, axis, 0.022, 0.003, 0.09)
     found = fitted(seen([blade]), start(0.006, 8.0, 0.02))
     assert np.linalg.norm(found.position - TIP) < 0.002
+
+
+def test_of_a_balls_axes_the_one_that_leads_outwards_is_taken_and_the_doubt_is_said() -> None:
+    radius = 0.02
+    stick = (TIP - radius * AXIS, AXIS, 0.003, 0.003, 0.1)
+    silhouettes = seen([ball(TIP - radius * AXIS, radius), stick])
+    starts = [start(0.006, angle, 0.015, seed) for seed, angle in enumerate((15.0, 30.0, 45.0))]
+    found = fit_outlines(silhouettes, starts, GRIP, REFINE, OUTLINE)
+    assert found is not None
+    fit, doubt = found
+    error = float(np.linalg.norm(fit.position - TIP))
+    assert fit.axis @ AXIS > np.cos(np.radians(15))
+    assert error < 0.005
+    assert error**2 < 7.8 * (doubt + 0.001**2)
+
+
+def test_a_flat_end_leaves_no_doubt() -> None:
+    found = fit_outlines(seen([round_bar()]), [start(0.01, 20.0, 0.01)], GRIP, REFINE, OUTLINE)
+    assert found is not None
+    assert found[1] < 0.002**2
+
+
+def test_the_middle_of_a_wide_edge_is_a_start_where_its_corner_is_farthest() -> None:
+    basis = across_axis(AXIS)
+    axis = AXIS + 0.15 * basis[:, 0]
+    blade = (TIP, axis / np.linalg.norm(axis), 0.0375, 0.003, 0.08)
+    spheres = np.array([[*GRIP, 0.02]])
+    hull = visual_hull(seen([blade]), spheres, 0.3, HullParams())
+    far = hull.voxels[np.argmax(np.linalg.norm(hull.voxels - GRIP, axis=1))]
+    assert np.linalg.norm(far - TIP) > 0.03
+    found = locate_far_side(hull, far, spheres, EndParams())
+    assert np.linalg.norm(found.position - TIP) < 0.018
+    assert found.axis @ AXIS > np.cos(np.radians(12))

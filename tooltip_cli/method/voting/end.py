@@ -24,6 +24,7 @@ _BLURS = (1.5, 2.0, 2.5, 3.0)  # bins, standard deviations tried for how blurred
 _NO_SCORE = np.inf
 _BESIDE = 27  # voxels about one, itself among them
 _SOLID_VOXELS = 2000  # of a solid, whose axis is looked for
+_FAR_SIDE_ROUNDS = 3  # of finding its middle and the axis through it
 _LEAST_RADIUS = 0.001  # metres, of an end
 _MARGIN = 4  # voxels around the points, so that smoothing does not meet the box
 
@@ -155,6 +156,30 @@ def locate_hull_end(shape: Shape, far: Array, spheres: Array, params: EndParams)
     core = across <= max(radius, 1.5 * params.voxel) ** 2
     top = float(np.quantile(along[core], 0.98)) if core.any() else 0.0
     return ToolEnd(middle + axis * (top - 0.5 * params.voxel), axis, radius, 0.0)
+
+
+def locate_far_side(shape: Shape, far: Array, spheres: Array, params: EndParams) -> ToolEnd:
+    """Find the middle of all that a solid shows farthest from the grip, about ``far`` (3,), metres.
+
+    The far voxel of a wide edge is its corner, from which the end as found by what is slender may
+    be centimetres off: here the axis is taken to lead away from the grip.
+    """
+    grip = grip_of(spheres)
+    near = shape.voxels[np.linalg.norm(shape.voxels - far, axis=1) < params.neighbourhood]
+    position = far
+    for _ in range(_FAR_SIDE_ROUNDS):
+        axis = _unit(position - grip)
+        position = position + _middle(near - position, axis, params.wide, params)
+    axis = _unit(position - grip)
+    along = (near - position) @ axis
+    across = np.square(near - position).sum(axis=1) - along * along
+    inside = across < params.wide**2
+    top = float(np.quantile(along[inside], 0.98)) if inside.any() else 0.0
+    last = inside & (along > top - params.middle_slab)
+    radius = float(np.sqrt(across[last].mean())) if last.any() else 0.0
+    return ToolEnd(
+        position + axis * (top - 0.5 * params.voxel), axis, max(radius, _LEAST_RADIUS), 0.0
+    )
 
 
 @dataclass(frozen=True)

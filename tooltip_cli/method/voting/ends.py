@@ -18,6 +18,7 @@ from tooltip_cli.method.voting.end import (
     far_voxels,
     grip_of,
     locate_end,
+    locate_far_side,
     locate_hull_end,
     tool_shape,
 )
@@ -135,7 +136,10 @@ def _rough_ends(
         for row, by_grip in _both_ways(sure, grip, settings):
             far = sure.voxels[row]
             near = [end for at, end, _ in votes if np.linalg.norm(at - far) < same]
-            solid = [locate_hull_end(sure, far, spheres, params)]
+            solid = [
+                locate_hull_end(sure, far, spheres, params),
+                locate_far_side(sure, far, spheres, params),
+            ]
             solid += [
                 locate_hull_end(hull, bulge, spheres, params)
                 for bulge in bulges
@@ -198,10 +202,11 @@ def first_end(edges: HandEdges, spheres: Array, settings: VotingSettings) -> Clo
         return None
     rough, *others = _rough_ends(edges, cloud, shape, spheres, settings)
     refine = settings.refine
-    fit = _outline_fit(
+    found = _outline_fit(
         edges, rough, spheres, settings, replace(refine, loss_px=refine.first_loss_px)
     )
-    if fit is not None and edges.silhouettes is not None:
+    if found is not None and edges.silhouettes is not None:
+        fit, _ = found
         near = near_outlines(edges.silhouettes, fit.position, refine)
         return ClosePart(near, fit.position, fit.axis, fit.radius)
     voted = next((item.voted for item in (rough, *others) if item.voted is not None), None)
@@ -217,23 +222,29 @@ def _outline_fit(
     spheres: Array,
     settings: VotingSettings,
     refine: RefineParams,
-) -> Fit | None:
-    """Return what the silhouettes' outlines say of an end; None: there are none, or nothing."""
+) -> tuple[Fit, float] | None:
+    """Return what the outlines say of an end, and how far others lie; see `fit_outlines`.
+
+    None: there are no silhouettes, or they say nothing.
+    """
     if edges.silhouettes is None:
         return None
     starts = [*rough.solid, *([] if rough.voted is None else [rough.voted])]
-    fit = fit_outlines(edges.silhouettes, starts, grip_of(spheres), refine, settings.outline)
-    return None if fit is None or fit.agreement(refine) < refine.min_agreement else fit
+    found = fit_outlines(edges.silhouettes, starts, grip_of(spheres), refine, settings.outline)
+    return None if found is None or found[0].agreement(refine) < refine.min_agreement else found
 
 
 def _by_outlines(
     edges: HandEdges, rough: _Rough, spheres: Array, settings: VotingSettings
 ) -> FoundEnd | None:
     """Put an end right by the silhouettes' outlines; None: there are none, or too few agree."""
-    fit = _outline_fit(edges, rough, spheres, settings, settings.refine)
-    if fit is None:
+    found = _outline_fit(edges, rough, spheres, settings, settings.refine)
+    if found is None:
         return None
+    fit, doubt = found
     refined = resampled(fit, settings.refine, settings.trust.seed)
+    covariance = refined.position_covariance + doubt * np.eye(3)
+    refined = replace(refined, position_covariance=covariance)
     return _refined(refined, fit.support(settings.refine), settings)
 
 

@@ -87,6 +87,9 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     reasons = () if len(candidates) == 1 else (_ambiguous(candidates),)
     if agreement < trust.doubtful_agreement:
         reasons = (*reasons, _disagreeing(agreement))
+    if first.covariance is not None:
+        std = float(np.linalg.eigvalsh(first.covariance)[-1] ** 0.5)
+        reasons = (*reasons, _uncertain(std)) if std > trust.doubtful_std else reasons
     return TipEstimate(METHOD, first.position, first.covariance, tuple(candidates), reasons, used)
 
 
@@ -142,6 +145,14 @@ def _disagreeing(agreement: float) -> Reason:
         (share if agreement else "the images show too little of the end")
         + "; the clocks or the camera's pose may be off: --refine all, or tooltip calibrate, finds "
         "out by how much",
+    )
+
+
+def _uncertain(std: float) -> Reason:
+    return Reason(
+        "uncertain_end",
+        f"the end may lie {1000 * std:.0f} mm away (one standard deviation), as it is round or "
+        "wide or the images show little of it; turn it so that the camera sees it from more sides",
     )
 
 

@@ -21,6 +21,7 @@ from tooltip_cli.method.voting.sight import NearEdges, near_outlines, point_of
 from tooltip_cli.method.voting.silhouette import HandSilhouettes
 
 _STEPS_AT_FIRST, _STEPS = 2, 8  # of the solver in each round
+_NEXT_TO, _PARALLEL, _AS_WIDE = 0.002, 0.99, 0.1  # of starts: metres, cosine, logarithm of width
 _UNLIKE_WIDTH = 0.3  # of the logarithm of the radius
 _CLOSE = 4  # the first round that looks as closely as the last
 
@@ -31,6 +32,14 @@ class _Start:
     axis: Array  # (3,) unit vector
     radius: float  # metres
 
+    def resembles(self, other: _Start) -> bool:
+        """Return whether the fit from there is the same, as far as can be foreseen."""
+        return bool(
+            np.linalg.norm(self.position - other.position) < _NEXT_TO
+            and self.axis @ other.axis > _PARALLEL
+            and abs(np.log(self.radius / other.radius)) < _AS_WIDE
+        )
+
 
 def fit_outlines(
     silhouettes: HandSilhouettes,
@@ -38,12 +47,16 @@ def fit_outlines(
     grip: Array,
     refine: RefineParams,
     params: OutlineParams,
-) -> Fit | None:
+) -> tuple[Fit, float] | None:
     """Return the end that explains most of what the outlines show about some rough ends.
 
     Args:
         ends: rough ends, within a few centimetres of one another.
         grip: (3,) metres, hand frame; the tool leads away from it.
+
+    Returns:
+        the end, and the variance along each axis, m^2, of others that explain nearly as much; None:
+        there are too few outlines.
     """
     refine = replace(refine, max_move=params.max_move, point_share=params.point_share)
     centre = np.mean([end.position for end in ends], axis=0)
@@ -54,30 +67,35 @@ def fit_outlines(
         rounds=params.rounds_at_first,
         min_frames=max(refine.min_frames // every, params.least_frames),
     )
-    tried = _fits(near.thinned(every), _starts(ends, grip, refine, params), few, _STEPS_AT_FIRST)
-    fits = _fits(near, _unlike(tried, params), refine, first_round=_CLOSE)
+    starts = _starts(ends, grip, refine, params)
+    tried = _fits(near.thinned(every), starts, few, _STEPS_AT_FIRST)
+    outwards = _as_good(tried, grip, refine, params)[:1]
+    kept = _unlike([*outwards, *tried], params)
+    fits = _fits(near, kept, refine, first_round=_CLOSE)
     if not fits:
         return None
     widest = max(start.radius for start, _ in fits)
-    return _at_point(silhouettes, near, fits[0][1], widest, refine, params)
+    (_, best), *others = _as_good(fits, grip, refine, params)
+    away = np.array([np.sum((fit.position - best.position) ** 2) for _, fit in others])
+    doubt = float(away.mean()) / 3 if len(away) else 0.0
+    return _at_point(silhouettes, near, best, widest, refine, params), doubt
 
 
 def _starts(
     ends: Sequence[ToolEnd], grip: Array, refine: RefineParams, params: OutlineParams
 ) -> list[_Start]:
-    starts = []
+    starts: list[_Start] = []
     for end in ends:
-        outwards = end.position - grip
         axes = [
             end.axis,
             *turned_axes(end.axis, refine.start_turn_deg),
-            outwards / max(float(np.linalg.norm(outwards)), 1e-9),
+            _unit(end.position - grip),
         ]
-        starts += [
-            _Start(end.position, axis, factor * end.radius)
-            for factor in params.radius_factors
-            for axis in axes
-        ]
+        for factor in params.radius_factors:
+            for axis in axes:
+                start = _Start(end.position, axis, factor * end.radius)
+                if not any(start.resembles(other) for other in starts):
+                    starts.append(start)
     return starts
 
 
@@ -106,6 +124,25 @@ def _fits(
     ]
     found = [(start, fit) for start, fit in fits if fit is not None]
     return sorted(found, key=lambda item: -item[1].support(refine))
+
+
+def _as_good(
+    fits: Sequence[tuple[_Start, Fit]], grip: Array, refine: RefineParams, params: OutlineParams
+) -> list[tuple[_Start, Fit]]:
+    """Return those that explain nearly as much as the first, whose axis leads outwards first.
+
+    A ball looks the same about any axis, and the side of a jaw stops as sharply as its end.
+    """
+    if not fits:
+        return []
+    support = params.as_good_support * fits[0][1].support(refine)
+    agreement = params.as_good_agreement * fits[0][1].agreement(refine)
+    good = [
+        item
+        for item in fits
+        if item[1].support(refine) >= support and item[1].agreement(refine) >= agreement
+    ]
+    return sorted(good, key=lambda item: -float(_unit(item[1].position - grip) @ item[1].axis))
 
 
 def _unlike(tried: Sequence[tuple[_Start, Fit]], params: OutlineParams) -> list[_Start]:
@@ -153,3 +190,7 @@ def _at_point(
     behind = pointed.position - params.beside_depth * fit.axis
     beside = missing(silhouettes, behind + np.outer([0.5, 1.0], aside))
     return pointed if beside.max() > params.min_missing_beside else fit
+
+
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-9))

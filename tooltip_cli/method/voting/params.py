@@ -152,6 +152,8 @@ class OutlineParams:
     frames_at_first: int = 40  # that all starts are tried on
     rounds_at_first: int = 6
     least_frames: int = 8  # of those, that must show the end
+    as_good_support: float = 0.88  # share of the most support: of these fits, the axis that leads
+    as_good_agreement: float = 0.9  # most away from the grip is taken; the same for agreement
     starts_kept: int = 4  # unlike ones, that are then tried on all frames
     point_share: float = 0.6  # as in RefineParams; the background beside the point decides
     # to each side of a point, that are looked at
@@ -186,6 +188,7 @@ class TrustParams:
     min_consistent: float = 0.55  # share of moving edges that fit something fixed to the hand
     convincing_agreement: float = 0.65  # of frames on the end: with it, less may be consistent
     doubtful_agreement: float = 0.6  # of what images show of the end: less is said
+    doubtful_std: float = 0.005  # metres, of the end in any direction: more is said
     min_in_view: float = 0.5  # share of the frames in which the tip lies inside the image
     halves: int = 6  # random halves of the frames that the end is found from again
     seed: int = 0  # of the halves
