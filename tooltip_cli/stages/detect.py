@@ -124,10 +124,8 @@ def detect_in(
     path = artifact_path(recording.path, SUFFIX, out)
     ensure_directory(path.parent)
     lap = laps()
-    if near is not None:
-        near.noise  # noqa: B018  (before threads want it)
-        lap("noise")
-    of_images = (lambda images: _SomePairs(images, params)) if near is None else near.part
+    of_images = (lambda images: _SomePairs(images, params)) if near is None else near.parts()
+    lap("noise")
     pairs = _Pairs(len(recording.image_stamps_ns), of_images, on_pair)
     look_through(recording, [pairs, *along], jobs)
     lap = laps()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -62,17 +63,22 @@ class NearHand:
         edges = looks[0].edges(self.noise)
         return near_motion(shown[0], shown[1], edges, self.hands[frame], self.noise, self.params)
 
-    def part(self, images: range) -> _SomePairs:
-        """Return the job of finding the tip in the pairs of some consecutive images."""
-        return _SomePairs(self, images)
+    def parts(self) -> Callable[[range], _SomePairs]:
+        """Return what finds the tip in the pairs of some consecutive images.
+
+        Raises:
+            TooltipError: an image that shows the noise cannot be decoded.
+        """
+        noise = self.noise  # before threads ask for it
+        return lambda images: _SomePairs(self, noise, images)
 
 
 class _SomePairs:
     """The pairs of some consecutive images."""
 
-    def __init__(self, near: NearHand, images: range) -> None:
+    def __init__(self, near: NearHand, noise: float, images: range) -> None:
         self.wanted = frozenset(images) if len(images) > 1 else frozenset()
-        self._near = near
+        self._near, self._noise = near, noise
         self._first: tuple[Shown, Look] | None = None
         self._rows: list[TipDetection] = []
 
@@ -86,26 +92,17 @@ class _SomePairs:
         lap("smooth")
         if self._first is not None:
             first, look_at_first = self._first
-            edges = look_at_first.edges(near.noise)
+            edges = look_at_first.edges(self._noise)
             lap("edges")
             hand = near.hands[index - 1]
-            self._rows.append(detect_near(first, second, edges, hand, near.noise, near.params, lap))
+            self._rows.append(
+                detect_near(first, second, edges, hand, self._noise, near.params, lap)
+            )
         self._first = second, look
 
     def result(self) -> list[TipDetection]:
         """Return the detections."""
         return self._rows
-
-
-def near_unless(
-    preset: str,
-    recording: Recording,
-    views: Views,
-    settings: VotingSettings | None = None,
-    detector: DetectorParams | None = None,
-) -> NearHand | None:
-    """Return the same, or None where the preset ``paper`` has all edges weighed."""
-    return None if preset == "paper" else near_hand(recording, views, settings, detector)
 
 
 def near_hand(
@@ -126,3 +123,14 @@ def near_hand(
         np.asarray(np.round(np.column_stack([centres, radii])) + 0.0, float),  # nor is there -0
         noise_frames(pairing, count),
     )
+
+
+def near_unless(
+    preset: str,
+    recording: Recording,
+    views: Views,
+    settings: VotingSettings | None = None,
+    detector: DetectorParams | None = None,
+) -> NearHand | None:
+    """Return the same, or None where the preset ``paper`` has all edges weighed."""
+    return None if preset == "paper" else near_hand(recording, views, settings, detector)
