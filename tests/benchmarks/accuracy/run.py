@@ -17,11 +17,13 @@ the part of them within 10 px of the true tip. ``--wrong`` makes every rig wrong
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -62,6 +64,9 @@ WRONG = Correction(0.03, np.radians([0.68, -0.57, 0.46]), np.array([0.0030, -0.0
 GOOD_PX = 10.0  # mean error of a run that is worth a warning
 CHI2_95 = 7.815  # three degrees of freedom
 
+Case: TypeAlias = tuple[Path, "Path | None", str]
+"""A recording, its rig file if it has one, and what it is listed under."""
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -74,18 +79,28 @@ def main() -> None:
     parser.add_argument("--wrong", action="store_true", help="make every rig wrong")
     parser.add_argument("--recordings", nargs="*", type=Path, default=[])
     arguments = parser.parse_args()
-    rows = []
     recordings = [path for path in arguments.recordings if len(path.suffixes) == 1]
-    cases = [(path, _rig_beside(path), "given") for path in recordings]
+    cases = iter([(path, _rig_beside(path), "given") for path in recordings])
     if not arguments.recordings:
-        cases = list(_simulated(arguments))
+        cases = simulated(arguments.work, arguments.tools, arguments.seeds, arguments.perturb)
+    score_all(cases, arguments.methods, arguments.work, arguments.wrong, arguments.preset)
+
+
+def score_all(
+    cases: Iterable[Case],
+    methods: list[str],
+    work: Path,
+    wrong: bool = False,
+    preset: str = "voting",
+) -> None:
+    """Score every recording, print a line for each and a summary, write ``accuracy.json``."""
+    rows = []
     for path, rig, group in cases:
-        out = arguments.work / "results"
         smaller = SMALLER_SPHERES_M if group == "spheres" else 0.0
-        for row in _score(path, rig, arguments, out, smaller):
+        for row in _score(path, rig, methods, work / "results", wrong, smaller, preset):
             rows.append({"group": group, **row})
             print(_line(rows[-1]), flush=True)
-    (arguments.work / "accuracy.json").write_text(json.dumps(rows, indent=1))
+    (work / "accuracy.json").write_text(json.dumps(rows, indent=1))
     for group in dict.fromkeys(row["group"] for row in rows):
         for method in dict.fromkeys(row["method"] for row in rows):
             _summary(
@@ -98,30 +113,37 @@ def _rig_beside(path: Path) -> Path | None:
     return beside if beside.exists() else None
 
 
-def _simulated(arguments: argparse.Namespace) -> Any:
-    arguments.work.mkdir(parents=True, exist_ok=True)
-    for perturbation in arguments.perturb:
-        for seed in arguments.seeds:
-            for tool in arguments.tools:
-                params = SimParams(tool=tool, seed=seed)
-                params = replace(params, **PERTURBATIONS[perturbation])
-                made = "none" if perturbation == "spheres" else perturbation
-                path = arguments.work / f"{tool}-{seed}-{made}.mcap"
-                yield reuse_simulation(params, path, jobs=2).recording, None, perturbation
+def simulated(
+    work: Path,
+    tools: Iterable[str],
+    seeds: Iterable[int],
+    perturbations: Iterable[str],
+    scene: Callable[[str, int], dict[str, Any]] = lambda tool, seed: {},
+) -> Iterator[Case]:
+    """Simulate what ``work`` does not hold yet, in the scene of each tool and seed."""
+    work.mkdir(parents=True, exist_ok=True)
+    for perturbation, seed, tool in itertools.product(perturbations, seeds, tools):
+        changes = {**scene(tool, seed), **PERTURBATIONS[perturbation]}
+        params = replace(SimParams(tool=tool, seed=seed), **changes)
+        made = "none" if perturbation == "spheres" else perturbation
+        path = work / f"{tool}-{seed}-{made}.mcap"
+        yield reuse_simulation(params, path, jobs=2).recording, None, perturbation
 
 
 def _score(
     path: Path,
     rig_path: Path | None,
-    arguments: argparse.Namespace,
+    methods: list[str],
     out: Path,
+    wrong: bool,
     smaller: float,
+    preset: str,
 ) -> list[dict[str, Any]]:
     recording = read_recording(path)
     rig = resolve_rig(recording, rig_path)
     spheres = [replace(item, radius=item.radius - smaller) for item in rig.spheres]
     rig = replace(rig, spheres=tuple(spheres))
-    if arguments.wrong:
+    if wrong:
         rig = put_right(recording, rig, WRONG)
     views = resolve_views(recording, rig)
     labels = match_labels(
@@ -134,7 +156,7 @@ def _score(
     rows = [
         {"name": path.stem, "method": "labels", **_errors(baseline, views, labels.visible, truth)}
     ]
-    for method in arguments.methods:
+    for method in methods:
         start = time.perf_counter()
         name, _, what = method.partition("+")
         found_all = estimate_from_images(
@@ -142,7 +164,7 @@ def _score(
             views,
             EstimatorParams(method=name),
             unlabelled(recording, views.camera, None),
-            preset=arguments.preset,
+            preset=preset,
             refine=(rig, what) if what else None,
             out=out / method,
             force=True,
