@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy.typing as npt
 from tooltip_cli.method.affine import fit_background, mahalanobis
 from tooltip_cli.method.blocks import BlockMatches, match_blocks, window_margin
 from tooltip_cli.method.canny import edge_points
-from tooltip_cli.method.types import Array, Indices
+from tooltip_cli.method.types import Array, Indices, Mask
 from tooltip_cli.method.voting.params import MovingParams
 from tooltip_cli.method.voting.silhouette import FrameSilhouette, Silhouettes, join_silhouettes
 
@@ -87,9 +88,11 @@ def noise_level(pairs: list[tuple[Image, Image]]) -> float:
     Returns:
         Grey levels; at least half of one, which is rounding.
     """
+    import cv2
+
     levels = []
     for first, second in pairs:
-        difference = np.abs(first.astype(np.int16) - second.astype(np.int16))
+        difference = np.asarray(cv2.absdiff(first, second))
         # the median of integers is too coarse at low noise: interpolate its histogram
         share = np.cumsum(np.bincount(difference.ravel(), minlength=2)) / difference.size
         level = int(np.searchsorted(share, 0.5))
@@ -115,6 +118,24 @@ def halve(image: Image, times: int) -> Image:
     return image
 
 
+def canny_thresholds(noise: float, params: MovingParams) -> tuple[int, int]:
+    """Return the thresholds of edges in smoothed images; Canny takes whole numbers.
+
+    Args:
+        noise: of the raw images, grey levels.
+    """
+    low = params.canny_low * max(noise, 1.0)
+    return math.floor(low), math.floor(low * params.canny_ratio)
+
+
+def image_edges(
+    image: Image, thresholds: tuple[int, int], params: MovingParams
+) -> npt.NDArray[np.int32]:
+    """Find the edges of one image (H, W) gray, smoothed; (N, 2) u, v, row by row."""
+    margin = window_margin(params.block, params.search)
+    return np.array(edge_points(image, *thresholds, margin))  # without the room for more
+
+
 def moving_edges(
     image: Image,
     others: tuple[Image, Image],
@@ -123,6 +144,7 @@ def moving_edges(
     noise: float,
     params: MovingParams,
     level: int = 0,
+    edges: npt.NDArray[np.int32] | None = None,
 ) -> FrameEdges:
     """Find the edges of one image that move against the background to either partner.
 
@@ -133,19 +155,19 @@ def moving_edges(
         noise: of the raw images, grey levels.
         level: how often images are halved for the motion to fit the search window; matches that
             are found there are made exact on the whole images.
+        edges: (N, 2) u, v, where they are known, see `image_edges`.
     """
-    low = params.canny_low * max(noise, 1.0)
+    if edges is None:
+        edges = image_edges(image, canny_thresholds(noise, params), params)
     scale = 2**level
-    margin = scale * window_margin(params.block, params.search) + scale // 2
-    edges = edge_points(image, low, low * params.canny_ratio, margin)
+    if level:
+        edges = _inside(
+            edges, scale * window_margin(params.block, params.search) + scale // 2, image
+        )
     affines = np.full((2, 2, 3), np.nan)
     if len(edges) < _FLAT:
         return _nothing(affines)
-    du, dv = edges[:, 0] - hand_pixel[0], edges[:, 1] - hand_pixel[1]
-    # a mask as an index takes ten times as long with rows of two
-    near = np.compress(du * du + dv * dv < hand_radius_px**2, edges, axis=0)
-    place = near[:, 1] * image.shape[1] + near[:, 0]  # in all pixels, row by row
-    changed = np.zeros(len(near), dtype=bool)
+    differs = np.zeros(image.shape, dtype=bool)
     sample = _sample(edges, params)
     small = halve(image, level)
     pairs = [_Pair(image, other, small, halve(other, level), scale, params) for other in others]
@@ -155,8 +177,8 @@ def moving_edges(
         if fit is None:
             return _nothing(affines)
         affines[side] = fit.model
-        changed |= _changed(image, other, fit.model, noise, params).ravel().take(place)
-    edges = np.compress(changed, near, axis=0)
+        differs |= changed(image, other, fit.model, noise, params)
+    edges = within(on_mask(differs, edges), hand_pixel, hand_radius_px)
     found = [pair.match(edges) for pair in pairs]
     weights = [
         mahalanobis(model, edges, match.translations, match.covariances)
@@ -169,6 +191,26 @@ def moving_edges(
         np.stack([match.translations[moving] for match in found], axis=1).astype(np.int8),
         np.stack([match.covariances[moving] for match in found], axis=1).astype(np.float32),
     )
+
+
+def _inside(edges: npt.NDArray[np.int32], margin: int, image: Image) -> npt.NDArray[np.int32]:
+    """Return the edges (N, 2) that are at least so many pixels inside an image's border."""
+    height, width = image.shape
+    least, most = edges.min(axis=1), np.array([width, height]) - margin
+    return np.compress((least >= margin) & (edges < most).all(axis=1), edges, axis=0)
+
+
+def on_mask(mask: Mask, edges: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Return the edges (N, 2) at which a mask (H, W) is true."""
+    place = edges[:, 1] * mask.shape[1] + edges[:, 0]  # in all pixels, row by row
+    # a mask as an index takes ten times as long with rows of two
+    return np.compress(mask.ravel().take(place), edges, axis=0)
+
+
+def within(edges: npt.NDArray[np.int32], pixel: Array, radius_px: float) -> npt.NDArray[np.int32]:
+    """Return the edges (N, 2) that are less than so far from a pixel (2,)."""
+    du, dv = edges[:, 0] - pixel[0], edges[:, 1] - pixel[1]
+    return np.compress(du * du + dv * dv < radius_px**2, edges, axis=0)
 
 
 def _sample(edges: npt.NDArray[np.int32], params: MovingParams) -> npt.NDArray[np.int32]:
@@ -228,10 +270,10 @@ class _Pair:
         )
 
 
-def _changed(
+def changed(
     image: Image, other: Image, model: Array, noise: float, params: MovingParams
 ) -> npt.NDArray[np.bool_]:
-    """Return (H, W) where the images differ after the background's motion is undone."""
+    """Return (H, W) where smoothed images differ after the background's motion is undone."""
     import cv2
 
     height, width = image.shape
