@@ -45,6 +45,7 @@ class ToolEnd:
     axis: Array  # (3,) unit vector, hand frame, out of the tool's end
     radius: float  # metres, root mean square distance of its last 3 cm from the axis
     support: float  # frames that show the end's densest voxel over all chosen frames
+    wide: bool = False  # whether it is the middle of all that is there, not of what is slender
 
 
 def tool_shape(cloud: Cloud, spheres: Array, reach: float, params: EndParams) -> Shape:
@@ -176,10 +177,9 @@ def locate_far_side(shape: Shape, far: Array, spheres: Array, params: EndParams)
     inside = across < params.wide**2
     top = float(np.quantile(along[inside], 0.98)) if inside.any() else 0.0
     last = inside & (along > top - params.middle_slab)
-    # twice the root mean square, about as far as it goes: other starts look at narrow ends
-    radius = 2.0 * float(np.sqrt(across[last].mean())) if last.any() else 0.0
+    radius = float(np.sqrt(across[last].mean())) if last.any() else 0.0
     position = position + axis * (top - 0.5 * params.voxel)
-    return ToolEnd(position, axis, max(radius, _LEAST_RADIUS), 0.0)
+    return ToolEnd(position, axis, max(radius, _LEAST_RADIUS), 0.0, wide=True)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from tooltip_cli.method.voting.silhouette import HandSilhouettes
 
 _STEPS_AT_FIRST, _STEPS = 2, 8  # of the solver in each round
 _NEXT_TO, _PARALLEL, _AS_WIDE = 0.002, 0.99, 0.1  # of starts: metres, cosine, logarithm of width
+_OUTWARDS = 0.978  # cosine: within 12 degrees of the way from the grip
 _UNLIKE_WIDTH = 0.3  # of the logarithm of the radius
 _CLOSE = 4  # the first round that looks as closely as the last
 
@@ -69,19 +70,14 @@ def fit_outlines(
     )
     starts = _starts(ends, grip, refine, params)
     tried = _fits(near.thinned(every), starts, few, _STEPS_AT_FIRST)
-    outwards = _as_good(tried, grip, refine, params)[:1]
-    kept = _unlike([*outwards, *tried], params)
-    fits = _fits(near, kept, refine, first_round=_CLOSE)
+    rough = _as_good(tried, grip, refine, params)
+    fits = _fits(near, _unlike([*rough[:1], *tried], params), refine, first_round=_CLOSE)
     if not fits:
         return None
     widest = max(start.radius for start, _ in fits)
-    (_, best), *others = _as_good(fits, grip, refine, params)
-    away = [
-        float(np.sum(np.square(fit.position - best.position))) / 3
-        for _, fit in others
-        if _outwards(fit, grip) > 0  # what leads back to the grip is no end
-    ]
-    doubt = float(np.mean(away)) if away else 0.0
+    good = _as_good(fits, grip, refine, params)
+    best = good[0][1]
+    doubt = max(_scatter(best, some, grip) for some in (rough, good))
     return _at_point(silhouettes, near, best, widest, refine, params), doubt
 
 
@@ -95,7 +91,8 @@ def _starts(
             *turned_axes(end.axis, refine.start_turn_deg),
             _unit(end.position - grip),
         ]
-        for factor in params.radius_factors:
+        factors = [it for it in params.radius_factors if it >= 1 or not end.wide]
+        for factor in factors:
             for axis in axes:
                 start = _Start(end.position, axis, factor * end.radius)
                 if not any(start.resembles(other) for other in starts):
@@ -135,7 +132,8 @@ def _as_good(
 ) -> list[tuple[_Start, Fit]]:
     """Return those that explain nearly as much as the first, whose axis leads outwards first.
 
-    A ball looks the same about any axis, and the side of a jaw stops as sharply as its end.
+    A ball looks the same about any axis, and the side of a jaw stops as sharply as its end. Of axes
+    that lead nearly outwards none is better than another.
     """
     if not fits:
         return []
@@ -146,7 +144,20 @@ def _as_good(
         for item in fits
         if item[1].support(refine) >= support and item[1].agreement(refine) >= agreement
     ]
-    return sorted(good, key=lambda item: -_outwards(item[1], grip))
+    return sorted(good, key=lambda item: -min(_outwards(item[1], grip), _OUTWARDS))
+
+
+def _scatter(best: Fit, fits: Sequence[tuple[_Start, Fit]], grip: Array) -> float:
+    """Return the mean variance along each axis, m^2, of fits about the best one.
+
+    What leads back to the grip is no end, and does not count.
+    """
+    squares = [
+        float(np.sum(np.square(fit.position - best.position)))
+        for _, fit in fits
+        if _outwards(fit, grip) > 0
+    ]
+    return float(np.mean(squares)) / 3 if squares else 0.0
 
 
 def _outwards(fit: Fit, grip: Array) -> float:
