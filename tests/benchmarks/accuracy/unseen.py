@@ -6,8 +6,8 @@ Example:
     python -m tests.benchmarks.accuracy.unseen --work /tmp/unseen --perturb tilt- grip- --tools hook
 
 The first set is that of ``unseen_tools.py``, the second of ``more_unseen_tools.py``; the simulator
-learns of them for this run alone. What is behind changes with tool and seed. Recordings are made once
-under ``--work`` and reused.
+learns of them for this run alone. What is behind changes with tool and seed. Recordings are made
+once under ``--work`` and reused.
 """
 
 from __future__ import annotations
