@@ -76,8 +76,12 @@ def fit_outlines(
         return None
     widest = max(start.radius for start, _ in fits)
     (_, best), *others = _as_good(fits, grip, refine, params)
-    away = np.array([np.sum((fit.position - best.position) ** 2) for _, fit in others])
-    doubt = float(away.mean()) / 3 if len(away) else 0.0
+    away = [
+        float(np.sum(np.square(fit.position - best.position))) / 3
+        for _, fit in others
+        if _outwards(fit, grip) > 0  # what leads back to the grip is no end
+    ]
+    doubt = float(np.mean(away)) if away else 0.0
     return _at_point(silhouettes, near, best, widest, refine, params), doubt
 
 
@@ -135,14 +139,19 @@ def _as_good(
     """
     if not fits:
         return []
-    support = params.as_good_support * fits[0][1].support(refine)
-    agreement = params.as_good_agreement * fits[0][1].agreement(refine)
+    support = params.as_good * fits[0][1].support(refine)
+    agreement = params.as_good * fits[0][1].agreement(refine)
     good = [
         item
         for item in fits
         if item[1].support(refine) >= support and item[1].agreement(refine) >= agreement
     ]
-    return sorted(good, key=lambda item: -float(_unit(item[1].position - grip) @ item[1].axis))
+    return sorted(good, key=lambda item: -_outwards(item[1], grip))
+
+
+def _outwards(fit: Fit, grip: Array) -> float:
+    """Return the cosine of the angle between the end's axis and the way to it from the grip."""
+    return float(_unit(fit.position - grip) @ fit.axis)
 
 
 def _unlike(tried: Sequence[tuple[_Start, Fit]], params: OutlineParams) -> list[_Start]:

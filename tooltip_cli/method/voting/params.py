@@ -152,8 +152,7 @@ class OutlineParams:
     frames_at_first: int = 40  # that all starts are tried on
     rounds_at_first: int = 6
     least_frames: int = 8  # of those, that must show the end
-    as_good_support: float = 0.88  # share of the most support: of these fits, the axis that leads
-    as_good_agreement: float = 0.9  # most away from the grip is taken; the same for agreement
+    as_good: float = 0.86  # share of the most support, and of its agreement: that explains as much
     starts_kept: int = 4  # unlike ones, that are then tried on all frames
     point_share: float = 0.6  # as in RefineParams; the background beside the point decides
     # to each side of a point, that are looked at
