@@ -31,7 +31,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--work", type=Path, required=True, help="directory for what is made")
     parser.add_argument("--set", default="first", choices=list(SETS), help="which tools")
-    parser.add_argument("--tools", nargs="+", choices=list(ALL), help="these instead of a set")
+    parser.add_argument(
+        "--tools", nargs="+", choices=list(ALL), metavar="TOOL", help="instead of a set"
+    )
     parser.add_argument("--seeds", nargs="+", type=int, default=[11])
     parser.add_argument("--perturb", nargs="+", default=["none"], choices=list(PERTURBATIONS))
     parser.add_argument("--methods", nargs="+", default=["voting"])
