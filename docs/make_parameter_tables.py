@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 PAGE = Path(__file__).parent / "paper-to-code.md"
-SOURCES = ("detector.py", "estimators.py", "voting/params.py")
+SOURCES = ("detector.py", "near.py", "estimators.py", "voting/params.py")
 BEGIN, END = "<!-- parameters: begin -->", "<!-- parameters: end -->"
 _METHOD = Path(__file__).parents[1] / "tooltip_cli" / "method"
 _SECTION = re.compile(r"\((\d\.\d[^)]*)\)")

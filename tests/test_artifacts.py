@@ -14,13 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.helpers.logs import Log, wrist_parts, write_log, write_true_labels
-from tests.helpers.robot import RIG, SPHERES, TIP
+from tests.helpers.robot import CAMERA, RIG, SPHERES, TIP
 from tooltip_cli import __version__
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.log.detections import read_detections, read_provenance
 from tooltip_cli.log.recording import read_recording
 from tooltip_cli.method.detector import DetectorParams
 from tooltip_cli.method.estimators import EstimatorParams
+from tooltip_cli.method.near import NearParams
+from tooltip_cli.method.voting.params import MovingParams
 from tooltip_cli.rig.rigfile import Rig, Sphere, rig_files
 from tooltip_cli.stages.artifacts import (
     artifact_path,
@@ -257,12 +259,48 @@ RIG_CHANGES: dict[str, tuple[Rig, bool]] = {
 
 
 @pytest.mark.parametrize("case", RIG_CHANGES)
-def test_editing_the_rig_never_redoes_detection(case: str, wrist: Log, tmp_path: Path) -> None:
+def test_editing_the_rig_never_redoes_detection_among_all_edges(
+    case: str, wrist: Log, tmp_path: Path
+) -> None:
     rig, depends = RIG_CHANGES[case]
+    run(wrist, preset="paper")
+    for name, text in rig_files(rig).items():
+        (tmp_path / name).write_text(text)
+    assert did(run(wrist, rig=tmp_path / "rig.yaml", preset="paper")) == (False, depends)
+
+
+NEAR_CHANGES: dict[str, tuple[Rig, bool]] = {
+    # what changes in the rig, and whether the hand is elsewhere in the images
+    "the hand": (replace(RIG, urdf=str(RIG.urdf).replace("0.42", "0.47")), True),
+    "time offset": (replace(RIG, time_offset_s=0.1), True),
+    "the camera": (replace(RIG, camera=replace(CAMERA, cx=CAMERA.cx + 3)), True),
+    "spheres": (replace(RIG, spheres=(*SPHERES, Sphere((0.0, 0.0, 0.02), 0.01))), False),
+    "less than a pixel": (replace(RIG, urdf=str(RIG.urdf).replace("0.42", "0.4200001")), False),
+}
+
+
+@pytest.mark.parametrize("case", NEAR_CHANGES)
+def test_detection_near_the_hand_is_redone_where_the_hand_moves_in_the_images(
+    case: str, wrist: Log, tmp_path: Path
+) -> None:
+    rig, depends = NEAR_CHANGES[case]
     run(wrist)
     for name, text in rig_files(rig).items():
         (tmp_path / name).write_text(text)
-    assert did(run(wrist, rig=tmp_path / "rig.yaml")) == (False, depends)
+    assert did(run(wrist, rig=tmp_path / "rig.yaml"))[0] == depends
+
+
+def test_the_presets_take_detections_of_their_own(wrist: Log) -> None:
+    near = run(wrist)
+    everywhere = run(wrist, preset="paper")
+    assert did(everywhere) == (True, True)
+    assert everywhere.detected is not None
+    assert everywhere.detected.key == detect(wrist.path).key  # which knows of no rig
+    assert detect(wrist.path).reused
+    again = run(wrist)
+    assert did(again) == (True, True)
+    assert again.key == near.key != everywhere.key
+    assert detect(wrist.path, preset="voting").reused
 
 
 def test_writing_the_same_rig_differently_redoes_nothing(wrist: Log, tmp_path: Path) -> None:
@@ -393,7 +431,7 @@ def test_provenance_says_where_a_result_comes_from(wrist: Log) -> None:
     recording = read_recording(wrist.path)
     assert found.detected is not None
     for origin, params in (
-        (read_provenance(found.detected.path), DetectorParams()),
+        (read_provenance(found.detected.path), NearParams(DetectorParams(), MovingParams())),
         (found.document["provenance"], {"method": "kmeans", "settings": PAPER}),
     ):
         assert origin is not None

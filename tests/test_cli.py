@@ -36,7 +36,7 @@ from tooltip_cli.log.container import LoggedAttachment, iterate
 from tooltip_cli.rig.rigfile import rig_files
 
 DETECT = ("detect", "--preset", "paper")
-ESTIMATE = ("estimate", "--method", "kmeans")
+ESTIMATE = ("estimate", "--method", "kmeans", "--preset", "paper")
 
 
 def files_in(folder: Path) -> list[str]:

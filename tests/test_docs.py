@@ -313,7 +313,7 @@ def test_the_limits_are_those_of_the_code() -> None:
     trust = TrustParams()
     assert f"about {trust.min_frames} images" in text
     assert f"{trust.min_view_angle_deg:.0f} degrees apart" in text
-    assert f"less than about {PairingParams().max_displacement_px:.0f} pixels" in text
+    assert f"less than about {PairingParams().fastest_px:.0f} pixels" in text
     assert f"searches to {MovingParams().reach} m" in text
 
 

@@ -14,7 +14,7 @@ from tooltip_cli.method.voting.estimate import METHOD, check_motion, estimate_by
 from tooltip_cli.method.voting.moving import MovingEdges
 from tooltip_cli.method.voting.pairing import pair_frames
 from tooltip_cli.method.voting.params import PairingParams, VotingParams, VotingSettings
-from tooltip_cli.method.voting.volume import HandEdges
+from tooltip_cli.method.voting.volume import HandEdges, reconstruct
 
 Array = npt.NDArray[np.float64]
 
@@ -48,10 +48,16 @@ def stick(rng: np.random.Generator, tip: Array, count: int = 60) -> Array:
     return np.asarray(along[:, None] * axis + across)
 
 
-def view(*tips: Array, extent: Array = WIDE, reach: float = REACH, wrong: float = 0.0) -> HandEdges:
+def view(
+    *tips: Array,
+    extent: Array = WIDE,
+    reach: float = REACH,
+    wrong: float = 0.0,
+    speed: float = 1.0,
+) -> HandEdges:
     """Return what is seen of sticks, other points of them in each frame; a share moves anyhow."""
     rng = np.random.default_rng(6)
-    poses = swinging()
+    poses = swinging(speed=speed)
     pairing = pair_frames(poses, FOCAL, SETTINGS.pairing)
     points, moved = [], []
     for frame, partners in zip(pairing.frames, pairing.partners, strict=True):
@@ -108,7 +114,7 @@ def test_a_hand_that_swings_about_two_axes_shows_the_tip() -> None:
     [
         ("no_motion", swinging(0, 0)),
         ("no_motion", swinging()[:20]),
-        ("too_fast", swinging(speed=30)),
+        ("too_fast", swinging(1.0, 1.0, speed=20)),
         ("depth_unobservable", swinging(0, 0, 1.0)),
         ("depth_unobservable", swinging(0.06, 0.06, 1.0)),
     ],
@@ -117,6 +123,19 @@ def test_motion_that_cannot_show_the_tip(code: str, poses: Array) -> None:
     reason = motion(poses)
     assert reason is not None
     assert reason.code == code
+
+
+def test_what_is_too_fast_is_told_how_fast_it_may_be() -> None:
+    reason = motion(swinging(1.0, 1.0, speed=20))
+    assert reason is not None
+    limit = 4 * SETTINGS.pairing.max_displacement_px
+    assert f"at most {limit:.0f} can be followed, which only 10 frames keep to" in reason.text
+    one_size = replace(SETTINGS, pairing=replace(SETTINGS.pairing, levels=1))
+    poses = swinging(1.0, 1.0, speed=5)
+    slower = check_motion(pair_frames(poses, FOCAL, one_size.pairing), poses, one_size)
+    assert slower is not None
+    assert "at most 7 can be followed" in slower.text
+    assert motion(poses) is None
 
 
 @pytest.fixture(scope="module")
@@ -215,6 +234,19 @@ def test_a_tool_that_reaches_beyond_the_search_is_refused() -> None:
 def test_edges_that_move_anyhow_are_refused() -> None:
     found = estimate_by_voting(view(TIP, wrong=1.0), SPHERES, SETTINGS)
     assert refusal_of(found) == "inconsistent_views"
+
+
+@pytest.mark.parametrize(("speed", "trusted"), [(1.0, True), (5.0, False)])
+def test_fast_motion_must_be_more_consistent(speed: float, trusted: bool) -> None:
+    edges = view(TIP, wrong=0.3, speed=speed)
+    share = reconstruct(edges, SETTINGS.voting).consistent
+    assert share > SETTINGS.trust.min_consistent
+    for limit, accepted in ((share + 0.05, trusted), (share - 0.05, True)):
+        trust = replace(SETTINGS.trust, fast_consistent=limit)
+        settings = replace(SETTINGS, trust=trust)
+        found = estimate_by_voting(edges, SPHERES, settings)
+        assert (found.status == "ok") == accepted
+        assert accepted or refusal_of(found) == "inconsistent_views"
 
 
 def test_poses_of_other_images_are_refused() -> None:

@@ -9,7 +9,15 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from tooltip_cli.method.voting.moving import FrameEdges, join, moving_edges, noise_level, smooth
+from tooltip_cli.method.voting.moving import (
+    FrameEdges,
+    _Pair,
+    halve,
+    join,
+    moving_edges,
+    noise_level,
+    smooth,
+)
 from tooltip_cli.method.voting.params import MovingParams
 
 Image = npt.NDArray[np.uint8]
@@ -18,6 +26,7 @@ Step = tuple[int, int]
 PARAMS = MovingParams()
 SHAPE = (140, 180)
 SQUARE = (70, 50, 40)  # left, top, side, pixels
+MARGIN = 20  # pixels that a scene goes on outside the image, at least as far as anything moves
 HAND = np.array([90.0, 70.0])
 EVERYWHERE = 1000.0
 NOISE = 1.5
@@ -34,9 +43,17 @@ def noisy(image: Image, sigma: float, seed: int) -> Image:
     return np.clip(np.round(image + noise), 0, 255).astype(np.uint8)
 
 
-def scene(square: Step, background: Step = (0, 0), second: Step | None = None) -> Image:
-    """Return a smoothed image whose square and background are shifted by (du, dv)."""
-    margin, (height, width), (left, top, side) = 20, SHAPE, SQUARE
+def scene(
+    square: Step, background: Step = (0, 0), second: Step | None = None, larger: int = 1
+) -> Image:
+    """Return a smoothed image whose square and background are shifted by (du, dv).
+
+    Args:
+        larger: times that image and square are larger than they are otherwise.
+    """
+    margin, height, width, left, top, side = (
+        larger * pixels for pixels in (MARGIN, *SHAPE, *SQUARE)
+    )
     whole = texture((height + 2 * margin, width + 2 * margin), 1)
     u, v = margin - background[0], margin - background[1]
     image: Image = whole[v : v + height, u : u + width].copy()
@@ -53,8 +70,8 @@ def find(before: Image, image: Image, after: Image, radius: float = EVERYWHERE) 
     return moving_edges(image, (before, after), HAND, radius, NOISE, PARAMS)
 
 
-def on_square(edges: FrameEdges, margin: int = 3) -> npt.NDArray[np.bool_]:
-    left, top, side = SQUARE
+def on_square(edges: FrameEdges, margin: int = 3, larger: int = 1) -> npt.NDArray[np.bool_]:
+    left, top, side = (larger * pixels for pixels in SQUARE)
     pixels = edges.pixels.astype(int) - (left, top)
     return np.asarray(((pixels >= -margin) & (pixels < side + margin)).all(axis=1))
 
@@ -107,6 +124,67 @@ def test_exactly_the_square_moves(background: Step, motion: Step) -> None:
     carried = np.einsum("kij,cj->kci", edges.affines, corners)
     np.testing.assert_allclose(carried, corners[None, :, :2] + shifts[:, None], atol=0.25)
     assert (edges.covariances[:, :, [0, 2]] >= PARAMS.alpha - 1e-6).all()
+
+
+@pytest.mark.parametrize(
+    ("level", "motion", "background"),
+    [
+        (1, (9, -3), (0, 0)),
+        (1, (-6, 8), (7, -4)),
+        (1, (10, 10), (0, 0)),
+        (2, (18, -7), (0, 0)),
+        (2, (-5, 13), (15, -9)),  # a camera that turns fast as well
+        (2, (-20, 17), (0, 0)),
+        (2, (3, 15), (1, 2)),
+    ],
+)
+def test_what_moves_far_is_followed_in_smaller_images(
+    level: int, motion: Step, background: Step
+) -> None:
+    after, behind = ((-step[0], -step[1]) for step in (motion, background))
+    image = scene((0, 0), larger=2)
+    others = (scene(motion, background, larger=2), scene(after, behind, larger=2))
+    edges = moving_edges(image, others, 2 * HAND, EVERYWHERE, NOISE, PARAMS, level)
+    hidden = int(np.abs(np.subtract(motion, background)).max())
+    assert on_square(edges, hidden + 3, 2).mean() > 0.99
+    inner = on_square(edges, -4, 2)
+    assert inner.sum() > 600
+    exact = (edges.translations[inner] == np.array([motion, after])).all(axis=(1, 2))
+    assert exact.mean() > 0.95
+    corners = np.array([[40, 40, 1], [320, 240, 1]], dtype=float)
+    carried = np.einsum("kij,cj->kci", edges.affines, corners)
+    shifts = np.array([background, behind], dtype=float)
+    np.testing.assert_allclose(carried, corners[None, :, :2] + shifts[:, None], atol=0.25)
+    # whole images alone do not see so far
+    lost = moving_edges(image, others, 2 * HAND, EVERYWHERE, NOISE, PARAMS)
+    found = (lost.translations[on_square(lost, -4, 2)] == np.array([motion, after])).all((1, 2))
+    assert found.mean() < 0.05 if len(found) else True
+
+
+@pytest.mark.parametrize("level", [1, 2])
+def test_what_small_images_cannot_tell_apart_stays_uncertain(level: int) -> None:
+    """Along a straight edge a match may lie anywhere in the window, which halving widens."""
+    image = np.full((160, 200), 60, dtype=np.uint8)
+    image[:, 100:] = 180
+    scale = 2**level
+    edges = np.array([[100, 80], [100, 90]], dtype=np.int32)
+    small = halve(image, level)
+    matches = _Pair(image, image, small, small, scale, PARAMS).match(edges)
+    assert (matches.translations == 0).all()
+    window = np.arange(-(PARAMS.search // 2), PARAMS.search // 2 + 1)
+    assert (matches.covariances[:, 2] >= PARAMS.alpha + scale**2 * np.mean(window**2)).all()
+    np.testing.assert_allclose(matches.covariances[:, 1], 0, atol=1e-9)
+    assert (matches.covariances[:, 0] < 1.5 * scale**2).all()
+
+
+@pytest.mark.parametrize("shape", [(64, 96), (63, 97)])
+def test_pixels_of_halved_images_lie_at_multiples(shape: Step) -> None:
+    dot = np.zeros(shape, dtype=np.uint8)
+    dot[32, 48] = 255
+    image = np.asarray(cv2.GaussianBlur(dot, (0, 0), 2.0) * 20, dtype=np.uint8)
+    for times in (0, 1, 2):
+        small = halve(image, times)
+        assert divmod(int(small.argmax()), small.shape[1]) == (32 >> times, 48 >> times)
 
 
 def test_edges_count_only_where_the_image_changes() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.test_voting_watching import FOCAL, sweep
-from tooltip_cli.method.types import Array
+from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.online import CausalPairing, Decided, Spread
 from tooltip_cli.method.voting.pairing import farthest_points, pair_frames
 from tooltip_cli.method.voting.params import PairingParams
@@ -22,8 +22,11 @@ def fed(poses: Array, params: PairingParams = EVERY) -> tuple[list[Decided], Cau
 
 @pytest.mark.parametrize("unknown", [0.0, 0.2])
 @pytest.mark.parametrize("count", [1, 2, 9, 15, 16, 31, 32, 300])
-def test_partners_are_those_of_the_whole_recording(count: int, unknown: float) -> None:
-    poses = sweep(300, 0.7, 0.8)[:count]
+@pytest.mark.parametrize("speed", [0.7, 3.0])
+def test_partners_are_those_of_the_whole_recording(
+    count: int, unknown: float, speed: float
+) -> None:
+    poses = sweep(300, speed, 0.8)[:count]
     poses[np.random.default_rng(3).random(count) < unknown] = np.nan
     decided, online = fed(poses)
     assert [item.frame for item in decided] == list(range(count))
@@ -34,9 +37,11 @@ def test_partners_are_those_of_the_whole_recording(count: int, unknown: float) -
     np.testing.assert_array_equal(
         np.array([item.displacements for item in paired]).reshape(-1, 2), whole.displacements
     )
+    assert [item.level for item in paired] == whole.levels.tolist()
     assert online.fastest_px == whole.fastest_px
     if count == 300:
         assert len(paired) > 100
+        assert len(np.unique(whole.levels)) > (speed > 1)
 
 
 def test_an_image_is_decided_as_soon_as_no_later_one_matters() -> None:
@@ -96,3 +101,37 @@ def test_everything_is_kept_while_there_is_room_and_nothing_twice_after() -> Non
 
 def test_equal_points_leave_room_for_others() -> None:
     assert spread_of(kept(np.array([[0.0], [0.0], [0.0], [2.0], [5.0]]), 3)) == 2.0
+
+
+def ranked(points: Array, ranks: Indices, capacity: int) -> list[int]:
+    spread, rows = Spread(capacity, points.shape[1]), np.full(capacity, -1)
+    for row, (point, rank) in enumerate(zip(points, ranks, strict=True)):
+        place = spread.place_for(point, int(rank))
+        if place is not None:
+            rows[place] = row
+            spread.put(place, point, int(rank))
+    return sorted(rows[rows >= 0].tolist())
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("low", [10, 20, 60])
+def test_those_of_a_higher_rank_make_room_and_leave_no_trace(seed: int, low: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, ranks = rng.random((100, 2)), (rng.permutation(100) >= low).astype(np.intp)
+    chosen = ranked(points, 2 * ranks, 20)
+    assert len(chosen) == 20
+    lower = np.flatnonzero(ranks == 0)
+    if low > 20:  # as if the others had never come
+        alone = ranked(points[lower], np.zeros(low, dtype=np.intp), 20)
+        assert chosen == lower[alone].tolist()
+    else:
+        assert np.isin(lower, chosen).all()
+
+
+def test_those_of_one_rank_are_spread_among_those_of_a_lower() -> None:
+    rng = np.random.default_rng(1)
+    points = np.concatenate([[[0.0, 0.0], [1.0, 1.0]], rng.random((500, 2))])
+    ranks = np.array([0, 0] + [1] * 500)
+    chosen = ranked(points, ranks, 20)
+    assert chosen[:2] == [0, 1]
+    assert spread_of(points[chosen]) > 2 * spread_of(points[:20])

@@ -84,6 +84,19 @@ def test_nothing_left_out_is_farther_than_what_was_chosen_is_apart(
     assert gaps.max() <= apart.min()
 
 
+@given(choices(), st.integers(0, 30))
+@settings(max_examples=100, deadline=None)
+def test_what_was_chosen_before_stays_chosen(
+    choice: tuple[Array, npt.NDArray[np.bool_], int], some: int
+) -> None:
+    features, usable, count = choice
+    before = farthest_points(features, usable, min(some, count))
+    after = farthest_points(features, usable, count, before)
+    assert len(after) == min(count, int(usable.sum()))
+    assert (np.diff(after) > 0).all()
+    assert np.isin(before, after).all()
+
+
 @given(choices(), st.permutations([0, 1, 2]))
 @settings(max_examples=50, deadline=None)
 def test_the_order_of_the_features_does_not_matter(
@@ -158,13 +171,76 @@ def test_a_still_hand_gives_no_frames() -> None:
 
 def test_a_hand_that_is_too_fast_gives_no_frames_and_says_how_fast() -> None:
     angles = np.zeros((60, 3))
-    angles[:, 0] = 0.15 * np.arange(60)  # never the same orientation within the longest gap
+    angles[:, 0] = 0.45 * np.arange(60)  # never the same orientation within the longest gap
     poses = poses_of(angles)
     pairing = pair(poses)
     assert len(pairing.frames) == 0
     steps = [displacement(poses[i], poses[i + 1]) for i in range(59)]
     assert pairing.fastest_px == pytest.approx(np.median(steps))
-    assert pairing.fastest_px > PARAMS.max_displacement_px
+    assert pairing.fastest_px > PARAMS.fastest_px == 4 * PARAMS.max_displacement_px
+
+
+def both_sides(poses: Array, frame: int, scale: int) -> list[list[float]]:
+    """Return the usable displacements to images before and after, longhand, pixels."""
+    sides = []
+    for step in (-1, 1):
+        others = [frame + step * gap for gap in range(1, PARAMS.max_gap + 1)]
+        moved = [displacement(poses[frame], poses[i]) for i in others if 0 <= i < len(poses)]
+        low, high = scale * PARAMS.min_displacement_px, scale * PARAMS.max_displacement_px
+        sides.append([pixels for pixels in moved if low <= pixels <= high])
+    return sides
+
+
+@pytest.mark.parametrize("speed", [2.0, 4.0, 8.0])
+def test_images_are_halved_as_often_as_the_motion_needs(speed: float) -> None:
+    poses = swinging(80, speed)
+    every = PairingParams(frames=len(poses))
+    pairing = pair_frames(poses, FOCAL, every)
+    assert len(pairing.frames) > 20
+    for frame, moved, level in zip(
+        pairing.frames, pairing.displacements, pairing.levels, strict=True
+    ):
+        for lower in range(level):
+            assert not all(both_sides(poses, frame, 2**lower))
+        scale = 2**level
+        for found, usable in zip(moved, both_sides(poses, frame, scale), strict=True):
+            costs = [abs(np.log(pixels / (scale * PARAMS.displacement_px))) for pixels in usable]
+            assert abs(np.log(found / (scale * PARAMS.displacement_px))) == pytest.approx(
+                min(costs)
+            )
+    left = np.setdiff1d(np.arange(len(poses)), pairing.frames)
+    assert not any(all(both_sides(poses, i, 2**level)) for i in left for level in range(3))
+
+
+def test_twenty_pixels_an_image_are_followed() -> None:
+    angles = np.zeros((60, 3))
+    angles[:, 0] = 0.22 * np.arange(60)
+    pairing = pair(poses_of(angles))
+    assert 18 < pairing.fastest_px < 22
+    assert len(pairing.frames) == PARAMS.frames
+    assert (pairing.levels == 2).all()
+
+
+def test_where_whole_images_do_smaller_ones_change_nothing() -> None:
+    poses = swinging(200, 4.0)
+    few, many = PARAMS, PairingParams(frames=len(poses))
+    at_most = pair_frames(poses, FOCAL, many)
+    assert (at_most.levels > 0).any()  # there are some that only smaller images show
+    whole = pair_frames(poses, FOCAL, PairingParams(frames=few.frames, levels=1))
+    pairing = pair_frames(poses, FOCAL, few)
+    for name in ("frames", "partners", "displacements", "levels"):
+        np.testing.assert_array_equal(getattr(pairing, name), getattr(whole, name))
+    assert not pairing.levels.any()
+
+
+def test_frames_of_whole_images_are_kept_before_those_of_smaller_ones() -> None:
+    poses = swinging(200, 6.0)
+    whole = pair_frames(poses, FOCAL, PairingParams(frames=60, levels=1))
+    assert 0 < len(whole.frames) < 60
+    pairing = pair_frames(poses, FOCAL, PairingParams(frames=60))
+    assert len(pairing.frames) == 60
+    assert pairing.frames[pairing.levels == 0].tolist() == whole.frames.tolist()
+    assert pairing.levels.max() == 1  # halved once, there are enough
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

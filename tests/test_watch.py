@@ -19,19 +19,29 @@ import pytest
 
 from tests.helpers.cli import tooltip
 from tests.helpers.live import MjpegServer, free_port, play, played, udp_joints
-from tests.helpers.logs import FRAME_NS, image_message, jpeg_of, logged_image, stamp_of, wrist_parts
+from tests.helpers.logs import (
+    FRAME_NS,
+    Log,
+    image_message,
+    jpeg_of,
+    logged_image,
+    stamp_of,
+    wrist_parts,
+)
 from tests.helpers.robot import CAMERA, CAMERA_FRAME, RIG
 from tests.test_stage_voting import simulate, truth
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.log.messages import COMPRESSED_IMAGE, IMAGE, Message, encode, header
 from tooltip_cli.log.recording import Recording, read_recording
 from tooltip_cli.log.stopping import Stop
-from tooltip_cli.log.views import resolve_rig
+from tooltip_cli.log.views import resolve_rig, resolve_views
 from tooltip_cli.method.voting.params import PairingParams, VotingSettings
 from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.stages.calibrate import write_rig
 from tooltip_cli.stages.feeds import PlayedFeed
 from tooltip_cli.stages.keeping import FrameKeeper
+from tooltip_cli.stages.moving import find_moving_edges
+from tooltip_cli.stages.voting import pair_views
 from tooltip_cli.stages.watch import Update, WatchOptions, watch
 
 ROOT = Path(__file__).parents[1]
@@ -349,6 +359,23 @@ def test_what_is_kept_is_bounded() -> None:
         assert len(keeper.snapshot().frames) == 12
         assert keeper.window <= 2 * pairing.max_gap + 1
     assert keepers[1].changes > keepers[0].changes
+
+
+def test_fast_motion_is_followed_as_by_an_estimate(wrist: Log) -> None:
+    """For these search windows the hand is fast: images are halved, some of them twice."""
+    pairing = PairingParams(displacement_px=1.0, min_displacement_px=0.5, max_displacement_px=1.5)
+    settings = VotingSettings(pairing=pairing)
+    views = resolve_views(read_recording(wrist.path), RIG)
+    chosen, _ = pair_views(views, settings, views.known)
+    assert {1, 2} <= set(chosen.levels.tolist())
+    keeper = keeper_of(messages_of(wrist.frames), settings)
+    keeper.advance(lambda: 0, 0.0, at_end=True)
+    held = keeper.snapshot().frames
+    assert [item.frame for item in held] == chosen.frames.tolist()
+    assert [item.level for item in held] == chosen.levels.tolist()
+    found = find_moving_edges(read_recording(wrist.path), views, chosen, settings, 1)
+    assert sum(found.counts) > 0
+    assert [len(item.edges.pixels) for item in held] == pytest.approx(found.counts, rel=0.1)
 
 
 def test_images_that_come_too_fast_are_passed_over_and_counted() -> None:

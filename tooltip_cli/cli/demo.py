@@ -140,7 +140,7 @@ def _detect(path: Path, pairs: int, jobs: int, force: bool) -> None:
     from tooltip_cli.stages.detect import detect
 
     with progress(pairs, f"detect {path.name}") as advance:
-        found = detect(path, force=force, jobs=jobs, on_pair=advance)
+        found = detect(path, preset="voting", force=force, jobs=jobs, on_pair=advance)
     say(f"{path}: {_how(found.reused)} {found.path}")
 
 

@@ -14,6 +14,7 @@ from tooltip_cli.cli.options import (
     jobs_option,
     json_option,
     out_option,
+    preset_option,
     print_json,
     profile_option,
     progress,
@@ -28,18 +29,15 @@ if TYPE_CHECKING:
     from tooltip_cli.log.recording import Recording, Topics
     from tooltip_cli.method.types import Reason
     from tooltip_cli.stages.moving import DetectedEdges, PendingEdges
+    from tooltip_cli.stages.near import NearHand
 
 
 @click.command()
 @recordings_argument
 @rig_option
-@click.option(
-    "--preset",
-    type=click.Choice(["voting", "paper"]),
-    default="voting",
-    show_default=True,
-    help="paper: the tip's pixel in consecutive images. voting: that, and all moving edges of "
-    "frames paired by the hand's motion, which needs the rig.",
+@preset_option(
+    "paper: the tip's pixel in consecutive images, among all edges. voting: that, looked for near "
+    "the hand, and all moving edges of frames paired by the hand's motion; both need the rig."
 )
 @jobs_option
 @profile_option
@@ -65,9 +63,9 @@ def detect(
 
     Each pair of consecutive images gives the edge point that moves most against the background
     (paper, section 3.1). Writes STEM.detections.mcap, which opens beside the recording in a
-    viewer; these detections do not depend on the rig. Where the rig is known, also writes
-    STEM.edges.mcap for 'tooltip estimate --method voting': the moving edges of frames that are
-    paired by how far the hand moves between them.
+    viewer. Where the rig is known, only edges that the tool can reach are looked at, which takes
+    less time, and STEM.edges.mcap is written too, for 'tooltip estimate --method voting': the
+    moving edges of frames that are paired by how far the hand moves between them.
 
     \b
     Examples:
@@ -111,10 +109,20 @@ def _detect_one(
     recording = read_recording(path, topics)
     lap("read")
     has_rig = rig is not None or "rig.yaml" in recording.attachments
-    edges = _edges(recording, rig, out, force) if preset == "voting" and has_rig else None
+    near, edges = None, None
+    if preset == "voting" and has_rig:
+        near, edges = _by_rig(recording, rig, out, force)
     along = [edges.job] if isinstance(edges, PendingEdges) else []
     with progress(len(recording.image_stamps_ns) - 1, f"detect {path.name}") as advance:
-        found = detect_in(recording, out=out, force=force, jobs=jobs, on_pair=advance, along=along)
+        found = detect_in(
+            recording,
+            near=near,
+            out=out,
+            force=force,
+            jobs=jobs,
+            on_pair=advance,
+            along=along,
+        )
     for note in recording.notes:
         say(f"{path}: {note}")
     detections = found.detections
@@ -138,19 +146,21 @@ def _detect_one(
     return result
 
 
-def _edges(
+def _by_rig(
     recording: Recording, rig: Path | None, out: Path | None, force: bool
-) -> DetectedEdges | PendingEdges | Reason:
-    """Return the moving edges, what will find them, or why the motion shows nothing."""
+) -> tuple[NearHand, DetectedEdges | PendingEdges | Reason]:
+    """Return where the hand is, and the moving edges, what finds them, or why there are none."""
     from tooltip_cli.log.views import resolve_rig, resolve_views
     from tooltip_cli.method.voting.params import VotingSettings
     from tooltip_cli.stages.clock import laps
+    from tooltip_cli.stages.near import near_hand
     from tooltip_cli.stages.voting import edges_for_voting
 
     lap = laps()
     views = resolve_views(recording, resolve_rig(recording, rig))
+    near = near_hand(recording, views)
     lap("poses")
-    return edges_for_voting(recording, views, VotingSettings(), out=out, force=force)
+    return near, edges_for_voting(recording, views, VotingSettings(), out=out, force=force)
 
 
 def _finished(path: Path, edges: DetectedEdges | PendingEdges | Reason, jobs: int) -> str | None:

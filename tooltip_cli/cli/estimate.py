@@ -10,12 +10,14 @@ import click
 from tooltip_cli.cli.options import (
     METHODS,
     PATH,
+    PRESET_OF_DETECTIONS,
     check_names,
     force_option,
     jobs_option,
     json_option,
     out_option,
     prefer_option,
+    preset_option,
     print_json,
     profile_option,
     progress,
@@ -52,6 +54,7 @@ from tooltip_cli.cli.options import (
     help="Find the offset of the image clock (time), and where the camera really is (all), from "
     "the same images, and use what clearly helps. 'tooltip calibrate' writes it as a rig file.",
 )
+@preset_option(PRESET_OF_DETECTIONS)
 @prefer_option
 @jobs_option
 @profile_option
@@ -65,6 +68,7 @@ def estimate(
     recordings: tuple[Path, ...],
     rig: Path | None,
     method: str,
+    preset: str,
     prefer: tuple[float, float, float] | None,
     from_labels: Path | None,
     refine: str | None,
@@ -111,6 +115,7 @@ def estimate(
                 rig=rig,
                 topics=Topics(image=image, joints=joints, info=info, pose=pose),
                 params=EstimatorParams(method=method, voting=VotingSettings(prefer=prefer)),
+                preset=preset,
                 from_labels=from_labels,
                 refine=refine,
                 out=out,

@@ -11,10 +11,12 @@ import click
 from tooltip_cli.cli.options import (
     METHODS,
     PATH,
+    PRESET_OF_DETECTIONS,
     force_option,
     jobs_option,
     json_option,
     prefer_option,
+    preset_option,
     print_json,
     printable,
     progress,
@@ -59,6 +61,7 @@ EXIT_CODES = {"ok": 0, "refused": 3, "failed": 1}
     show_default=True,
     help="Estimator, as in 'tooltip estimate'.",
 )
+@preset_option(PRESET_OF_DETECTIONS)
 @prefer_option
 @click.option(
     "--train", type=click.IntRange(min=1), default=400, show_default=True, help="Training frames."
@@ -109,6 +112,7 @@ def evaluate(
     second_labels: Path | None,
     rig: Path | None,
     method: str,
+    preset: str,
     prefer: tuple[float, float, float] | None,
     train: int,
     test: int,
@@ -185,6 +189,7 @@ def evaluate(
             seed=seed,
             split=split,
             params=EstimatorParams(method=method, voting=VotingSettings(prefer=prefer)),
+            preset=preset,
             curve=curve,
             frame=frame,
             out=out,

@@ -10,8 +10,10 @@ import click
 from tooltip_cli.cli.options import (
     METHODS,
     PATH,
+    PRESET_OF_DETECTIONS,
     jobs_option,
     json_option,
+    preset_option,
     print_json,
     progress,
     rig_option,
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Of the estimate.",
 )
+@preset_option(PRESET_OF_DETECTIONS)
 @click.option("--out", type=PATH, help="Directory of the results. Default: beside the recording.")
 @jobs_option
 @topic_options
@@ -55,6 +58,7 @@ def export(
     as_tf: bool,
     rig: Path | None,
     method: str,
+    preset: str,
     out: Path | None,
     jobs: int,
     image: str | None,
@@ -103,6 +107,7 @@ def export(
             rig=rig,
             topics=Topics(image=image, joints=joints, info=info, pose=pose),
             params=EstimatorParams(method=method),
+            preset=preset,
             out=out,
             jobs=jobs,
             on_pair=advance,

@@ -125,6 +125,23 @@ def say_profile(name: str, stopwatch: Stopwatch | None) -> None:
         say(f"  {step:13s}{seconds:8.2f} s {seconds / total:5.0%}")
 
 
+def preset_option(text: str) -> Callable[[_Command], _Command]:
+    """Add ``--preset``, with what the choice means for this command."""
+    return click.option(
+        "--preset",
+        type=click.Choice(["voting", "paper"]),
+        default="voting",
+        show_default=True,
+        help=text,
+    )
+
+
+PRESET_OF_DETECTIONS = (
+    "Which detections to take, where any are: voting: looked for near the hand. paper: among all "
+    "edges, as in the paper."
+)
+
+
 def jobs_option(command: _Command) -> _Command:
     """Add ``--jobs``."""
     return click.option(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from tooltip_cli.errors import TooltipError
 from tooltip_cli.log import messages
 from tooltip_cli.log.container import LoggedAttachment, LoggedMessage, iterate, read_chunk
 from tooltip_cli.log.images import decode_compressed, decode_raw
+from tooltip_cli.log.joints import joint_samples
 from tooltip_cli.log.messages import decode_foreign
 from tooltip_cli.log.sync import sorted_unique
 from tooltip_cli.log.topics import choose_info, choose_topic
@@ -128,6 +129,14 @@ class LoggedImage:
     ) -> None:
         self._recording, self._index, self._message = recording, index, message
         self._sizes = sizes
+        self._made: dict[Hashable, Any] = {}
+
+    def once(self, key: Hashable, make: Callable[[], _T]) -> _T:
+        """Return what ``make`` returned to the first who asked this image for ``key``."""
+        if key not in self._made:
+            self._made[key] = make()
+        made: _T = self._made[key]
+        return made
 
     @cached_property
     def gray(self) -> Image:
@@ -324,14 +333,12 @@ class _Index:
 
     def _joint_tracks(self, topic: str) -> dict[str, JointTrack]:
         samples: dict[str, tuple[list[int], list[float]]] = {}
-        for payload in self._payloads[topic]:
-            message = decode_foreign(messages.JOINT_STATE, payload, f"{self.path}: {topic}")
-            stamp_ns = messages.ns_from_time(message.header.stamp)
+        for sample in joint_samples(self._payloads[topic], f"{self.path}: {topic}"):
             # positions may be left empty by a controller that reports only effort
-            for name, position in zip(message.name, message.position, strict=False):
-                stamps, positions = samples.setdefault(str(name), ([], []))
-                stamps.append(stamp_ns)
-                positions.append(float(position))
+            for name, position in zip(sample.names, sample.positions, strict=False):
+                stamps, positions = samples.setdefault(name, ([], []))
+                stamps.append(sample.stamp_ns)
+                positions.append(position)
         tracks: dict[str, JointTrack] = {}
         for name, (stamps, positions) in samples.items():
             values = np.array(positions)

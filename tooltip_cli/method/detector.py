@@ -39,13 +39,16 @@ class DetectorParams:
 
 @dataclass(frozen=True)
 class EdgeMotion:
-    """The weighted edge map of a pair of images."""
+    """The weighted edge map of a pair of images.
+
+    The background is fitted to the same edges (B = N), or near the hand to a sample of all.
+    """
 
     edges: Edges  # (N, 2) u, v in the first image, row-major order
     translations: npt.NDArray[np.int32]  # (N, 2) pixels
     covariances: Array  # (N, 3) C_uu, C_uv, C_vv, px^2
     weights: Array  # (N,) Mahalanobis distance to the background motion (it has no unit)
-    background: npt.NDArray[np.bool_]  # (N,) edges that the background model kept
+    background: npt.NDArray[np.bool_]  # (B,) edges that the model was fitted to: those it kept
     affine: Array  # (2, 3) A, first to second image
 
 
@@ -54,7 +57,7 @@ class TipDetection:
     """The edge that moves most against the background, or why there is none."""
 
     pixel: Array  # (2,) u, v; NaN when flagged
-    weight: float  # 0 when flagged as few_edges or singular_motion
+    weight: float  # 0 when flagged as few_edges or singular_motion, or nothing was weighed
     affine: Array  # (2, 3); NaN when there is no model
     edges: int
     background_edges: int
@@ -94,7 +97,7 @@ def find_edges(image: Image, params: DetectorParams) -> Edges:
     return edge_points(image, params.canny_low, params.canny_high, margin)
 
 
-def _not_asked(step: str) -> None:
+def not_asked(step: str) -> None:
     """Nobody wants to know that a step has ended."""
 
 
@@ -103,7 +106,7 @@ def edge_motion(
     second: Image,
     edges: Edges,
     params: DetectorParams,
-    lap: Callable[[str], None] = _not_asked,
+    lap: Callable[[str], None] = not_asked,
 ) -> EdgeMotion | str:
     """Return the weighted edge map, or the flag that says why there is none.
 
@@ -144,21 +147,28 @@ def detect_tip(
     second: Image,
     edges: Edges,
     params: DetectorParams,
-    lap: Callable[[str], None] = _not_asked,
+    lap: Callable[[str], None] = not_asked,
 ) -> TipDetection:
     """Select the heaviest edge of a pair of images; the first in row-major order of equals.
 
     Args are those of `edge_motion`.
     """
     motion = edge_motion(first, second, edges, params, lap)
-    if isinstance(motion, str):
-        nothing = np.full(2, np.nan)
-        return TipDetection(nothing, 0.0, np.full((2, 3), np.nan), len(edges), 0, (motion,))
-    heaviest = int(np.argmax(motion.weights))
-    weight = float(motion.weights[heaviest])
-    moving = weight >= params.min_weight
+    return no_detection(motion, len(edges)) if isinstance(motion, str) else heaviest(motion, params)
+
+
+def no_detection(flag: str, edges: int) -> TipDetection:
+    """Return why a pair of images with so many edges has no weighted edge map."""
+    return TipDetection(np.full(2, np.nan), 0.0, np.full((2, 3), np.nan), edges, 0, (flag,))
+
+
+def heaviest(motion: EdgeMotion, params: DetectorParams) -> TipDetection:
+    """Select the heaviest edge, the first of equals, if it is heavy enough to move."""
+    place = int(np.argmax(motion.weights)) if len(motion.weights) else None
+    weight = 0.0 if place is None else float(motion.weights[place])
+    moving = place is not None and weight >= params.min_weight
     return TipDetection(
-        motion.edges[heaviest].astype(float) if moving else np.full(2, np.nan),
+        motion.edges[place].astype(float) if moving else np.full(2, np.nan),
         weight,
         motion.affine,
         len(motion.edges),

@@ -10,7 +10,14 @@ import numpy as np
 from tooltip_cli.labels.files import MatchedLabels
 from tooltip_cli.log.recording import Recording
 from tooltip_cli.log.views import Views
-from tooltip_cli.method.detector import Detections, DetectorParams, edge_motion, find_edges
+from tooltip_cli.method.detector import (
+    NO_MOTION,
+    Detections,
+    DetectorParams,
+    EdgeMotion,
+    edge_motion,
+    find_edges,
+)
 from tooltip_cli.method.estimators import EstimatorParams
 from tooltip_cli.method.evaluation import Split
 from tooltip_cli.method.types import Array
@@ -41,6 +48,17 @@ class VotedShape:
     frames: int  # that it was reconstructed from
 
 
+Weigh = Callable[[int, Image, Image], EdgeMotion | str]
+"""Returns the weighted edge map of an image index, given that image and the next one, both gray."""
+
+
+def all_motion(
+    detector: DetectorParams, frame: int, first: Image, second: Image
+) -> EdgeMotion | str:
+    """Weigh all edges, as the paper does; see `Weigh`."""
+    return edge_motion(first, second, find_edges(first, detector), detector)
+
+
 @dataclass(frozen=True)
 class Scene:
     """A recording with all that its figures are drawn from."""
@@ -49,6 +67,8 @@ class Scene:
     views: Views
     detections: Detections
     detector: DetectorParams
+    preset: str  # voting or paper, as in `stages.evaluate`
+    weigh: Weigh
     estimator: EstimatorParams
     split: Split
     labels: MatchedLabels | None
@@ -217,7 +237,9 @@ def _edge_map(
 
     frame = int(table.frames[place])
     first, second = (np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)) for image in images)
-    motion = edge_motion(first, second, find_edges(first, scene.detector), scene.detector)
+    motion = scene.weigh(frame, first, second)
+    if not isinstance(motion, str) and not len(motion.edges):
+        motion = NO_MOTION
     picture = np.asarray(cv2.cvtColor(first // 3, cv2.COLOR_GRAY2BGR))
     shapes: list[Shape] = []
     data, colors = "u,v,weight\n", ""
@@ -244,6 +266,8 @@ def _edge_map(
             f"colour goes {_RAMP} ({most:.1f}). Edges above the threshold are drawn as dots; the "
             "ring marks the heaviest, the motion interest point (section 3.1)."
         )
+        if scene.preset != "paper":
+            colors += " Edges that the tool cannot reach, or where nothing changed, are left out."
         lines = zip(*motion.edges.T.tolist(), motion.weights.tolist(), strict=True)
         data += "".join(f"{x},{y},{weight:.6f}\n" for x, y, weight in lines)
     return overlay.drawing(

@@ -6,13 +6,14 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.log.detections import read_detections, read_provenance, write_detections
 from tooltip_cli.log.recording import LoggedImage, Recording, Topics, read_recording
+from tooltip_cli.log.views import resolve_rig, resolve_views
 from tooltip_cli.method.detector import (
     Detections,
     DetectorParams,
@@ -29,7 +30,10 @@ from tooltip_cli.stages.artifacts import (
     stage_key,
 )
 from tooltip_cli.stages.clock import Lap, laps
-from tooltip_cli.stages.passes import Job, look_through
+from tooltip_cli.stages.passes import Job, Part, look_through
+
+if TYPE_CHECKING:
+    from tooltip_cli.stages.near import NearHand
 
 SUFFIX = ".detections.mcap"
 VERSION = 1
@@ -47,7 +51,7 @@ class Detected:
 
 
 def detection_key(recording: Recording, params: DetectorParams) -> str:
-    """Return the key of a recording's detections; consecutive pairs do not depend on the rig."""
+    """Return the key of detections among all edges, which do not depend on the rig."""
     parents = {"recording": recording.sha256, "image_topic": recording.image_topic}
     return stage_key("detect", VERSION, parents, params)
 
@@ -57,6 +61,7 @@ def detect(
     *,
     topics: Topics | None = None,
     params: DetectorParams | None = None,
+    preset: str = "paper",
     out: Path | None = None,
     force: bool = False,
     jobs: int = 1,
@@ -65,6 +70,7 @@ def detect(
     """Find the tip's pixel in each pair of consecutive images (paper, 3.1), or reuse it.
 
     Args:
+        preset: ``paper``, or ``voting``: look for it near the hand, by the rig in the recording.
         out: directory for the artifact; default: beside the recording.
         force: compute even where a fresh artifact exists.
         jobs: threads; the result does not depend on them.
@@ -74,13 +80,22 @@ def detect(
         TooltipError: the recording cannot be read, or the artifact not written.
     """
     recording = read_recording(recording_path, topics or Topics())
-    return detect_in(recording, params=params, out=out, force=force, jobs=jobs, on_pair=on_pair)
+    near = None
+    if preset != "paper":
+        from tooltip_cli.stages.near import near_hand
+
+        views = resolve_views(recording, resolve_rig(recording, None))
+        near = near_hand(recording, views, detector=params)
+    return detect_in(
+        recording, params=params, near=near, out=out, force=force, jobs=jobs, on_pair=on_pair
+    )
 
 
 def detect_in(
     recording: Recording,
     *,
     params: DetectorParams | None = None,
+    near: NearHand | None = None,
     out: Path | None = None,
     force: bool = False,
     jobs: int = 1,
@@ -90,10 +105,12 @@ def detect_in(
     """Do the same for a recording that is already open; see :func:`detect`.
 
     Args:
+        params: of the paper's detector, which weighs all edges.
+        near: weigh those near the hand instead, by the parameters that this has.
         along: who is to see the images in the same pass, where one is made.
     """
     params = params or DetectorParams()
-    key = detection_key(recording, params)
+    key = detection_key(recording, params) if near is None else near.key
     if not force:
         for place in known_places(recording.path, SUFFIX, out):
             stored = _stored(place, key, recording)
@@ -106,7 +123,10 @@ def detect_in(
         )
     path = artifact_path(recording.path, SUFFIX, out)
     ensure_directory(path.parent)
-    pairs = _Pairs(len(recording.image_stamps_ns), params, on_pair)
+    lap = laps()
+    of_images = (lambda images: _SomePairs(images, params)) if near is None else near.parts()
+    lap("noise")
+    pairs = _Pairs(len(recording.image_stamps_ns), of_images, on_pair)
     look_through(recording, [pairs, *along], jobs)
     lap = laps()
     detections = _table(pairs.rows)
@@ -115,7 +135,7 @@ def detect_in(
         detections,
         recording.image_stamps_ns,
         recording.image_frame,
-        provenance(recording.path, recording.sha256, key, params),
+        provenance(recording.path, recording.sha256, key, near.params if near else params),
     )
     lap("write")
     return Detected(path, key, False, detections)
@@ -134,15 +154,24 @@ def _stored(place: Path, key: str, recording: Recording) -> Detections | None:
 
 
 class _Pairs:
-    """The job of finding the tip in all pairs of ``count`` images."""
+    """The job of finding the tip in all pairs of ``count`` images.
 
-    def __init__(self, count: int, params: DetectorParams, on_pair: Callable[[], None]) -> None:
+    Args:
+        of_images: returns the part of some consecutive images.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        of_images: Callable[[range], Part[list[TipDetection]]],
+        on_pair: Callable[[], None],
+    ) -> None:
         self.rows: list[TipDetection] = []
-        self._count, self._params, self._on_pair = count, params, on_pair
+        self._count, self._of_images, self._on_pair = count, of_images, on_pair
 
-    def part(self, start: int, stop: int) -> _SomePairs:
+    def part(self, start: int, stop: int) -> Part[list[TipDetection]]:
         """Return the pairs whose first images these are."""
-        return _SomePairs(range(start, min(stop + 1, self._count)), self._params)
+        return self._of_images(range(start, min(stop + 1, self._count)))
 
     def add(self, result: list[TipDetection]) -> None:
         """Take detections."""

@@ -53,6 +53,7 @@ from tooltip_cli.stages.detect import Detected, detect_in
 from tooltip_cli.stages.held_out import unlabelled
 from tooltip_cli.stages.moving import VERSION as EDGES_VERSION
 from tooltip_cli.stages.moving import DetectedEdges
+from tooltip_cli.stages.near import near_unless
 from tooltip_cli.stages.voting import vote
 
 SUFFIX = ".tip.json"
@@ -80,6 +81,7 @@ def estimate(
     topics: Topics | None = None,
     params: EstimatorParams | None = None,
     detector: DetectorParams | None = None,
+    preset: str = "voting",
     from_labels: Path | None = None,
     refine: str | None = None,
     out: Path | None = None,
@@ -94,6 +96,8 @@ def estimate(
 
     Args:
         rig: rig file; default: the one stored in the recording.
+        preset: ``voting`` or ``paper``: whether detections, where the method takes them, are looked
+            for near the hand or among all edges.
         from_labels: a label file to estimate from instead of detections (the paper's baseline).
         refine: ``time`` or ``all``: put clocks, or clocks and camera, right where that helps; for
             the method ``voting`` and from images alone.
@@ -119,6 +123,7 @@ def estimate(
             params,
             allowed,
             detector=detector,
+            preset=preset,
             refine=None if refine is None else (resolved, refine),
             out=out,
             force=force,
@@ -145,6 +150,7 @@ def estimate_from_images(
     allowed: npt.NDArray[np.bool_],
     *,
     detector: DetectorParams | None = None,
+    preset: str = "voting",
     refine: tuple[Rig, str] | None = None,
     out: Path | None = None,
     detected_out: Path | None = None,
@@ -156,14 +162,19 @@ def estimate_from_images(
 
     Args:
         allowed: (N,) images that may be used; a detection belongs to its first image.
-        detector: of the paper's methods, ``kmeans`` and ``map``.
+        detector: of the paper's methods, ``kmeans`` and ``map``; ``preset`` likewise.
         refine: the rig that the views are by, and what of it to put right (see :func:`estimate`).
         detected_out: directory for what is detected; default: ``out``.
     """
     detected_out = detected_out or out
     if params.method != "voting":
         detected = detect_in(
-            recording, params=detector, out=detected_out, jobs=jobs, on_pair=on_pair
+            recording,
+            params=detector,
+            near=near_unless(preset, recording, views, params.voting, detector),
+            out=detected_out,
+            jobs=jobs,
+            on_pair=on_pair,
         )
         return estimate_from_detections(
             recording, views, detected, params, allowed, out=out, force=force

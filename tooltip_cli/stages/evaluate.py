@@ -8,6 +8,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ from tooltip_cli.report.model import (
     table_from_plain,
 )
 from tooltip_cli.report.overall import Totals
-from tooltip_cli.report.scenes import Scene
+from tooltip_cli.report.scenes import Scene, all_motion
 from tooltip_cli.report.scoring import Truth, describe_labels, read_truth, states_by_frame
 from tooltip_cli.report.writer import ReportWriter
 from tooltip_cli.stages.artifacts import (
@@ -51,6 +52,7 @@ from tooltip_cli.stages.estimate import (
 from tooltip_cli.stages.held_out import LABELS_SUFFIX
 from tooltip_cli.stages.measure import Case, Labelled, Protocol, measure
 from tooltip_cli.stages.memory import give_back_freed, give_back_large_arrays
+from tooltip_cli.stages.near import near_unless
 from tooltip_cli.stages.shape import Voters, voted_shape
 
 VERSION = 5
@@ -92,6 +94,7 @@ def evaluate(
     split: str = "random",
     params: EstimatorParams | None = None,
     detector: DetectorParams | None = None,
+    preset: str = "voting",
     curve: bool | None = None,
     frame: int | None = None,
     out: Path | None = None,
@@ -113,6 +116,8 @@ def evaluate(
         second_labels: likewise, of a second annotator; default: ``STEM.labels.*.csv``.
         rig: rig file, or a folder with ``STEM.rig.yaml``; default: the one in the recording.
         split: ``random`` or ``blocks``; where labels exist they decide.
+        preset: ``voting`` or ``paper``: whether detections are looked for near the hand or among
+            all edges.
         curve: estimate from ever fewer training frames too, which takes several estimates;
             default: from as few as are quick.
         frame: image index that the figures of each recording show, or the test frame nearest to
@@ -133,7 +138,7 @@ def evaluate(
     _check_names(recordings)
     give_back_large_arrays()
     params, detector = params or EstimatorParams(), detector or DetectorParams()
-    protocol = Protocol(train, test, seed, split, params, detector, curve)
+    protocol = Protocol(train, test, seed, split, params, detector, curve, preset)
     split_frames(train + test, train, test, seed, split)  # refuses wrong sizes before any work
     report_dir = out if out is not None else recordings[0].parent / DEFAULT_DIRECTORY
     places = Places(report_dir, out, labels, second_labels, rig)
@@ -208,8 +213,14 @@ def evaluate_recording(
     views = resolve_views(recording, rig)
     labelled = find_labels(recording, views, places)
     split = _split(recording, labelled, protocol)
+    near = near_unless(protocol.preset, recording, views, protocol.params.voting, protocol.detector)
     detected = detect_in(
-        recording, params=protocol.detector, out=places.out, jobs=jobs, on_pair=on_pair
+        recording,
+        params=protocol.detector,
+        near=near,
+        out=places.out,
+        jobs=jobs,
+        on_pair=on_pair,
     )
     on_step(path, f"{_how(detected.reused)} {detected.path}")
     tips = places.report / "tips"
@@ -222,6 +233,7 @@ def evaluate_recording(
         protocol.params,
         allowed,
         detector=protocol.detector,
+        preset=protocol.preset,
         out=tips / "detections",
         detected_out=places.out,
         force=force,
@@ -241,6 +253,8 @@ def evaluate_recording(
         views,
         detected.detections,
         protocol.detector,
+        protocol.preset,
+        near.motion if near else partial(all_motion, protocol.detector),
         protocol.params,
         split,
         None if labelled is None else labelled.labels,

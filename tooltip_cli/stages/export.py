@@ -42,6 +42,7 @@ class Result:
     rig: Rig
     views: Views
     estimated: Estimated
+    preset: str = "voting"  # which detections it takes, as in `estimate_from_images`
 
     @property
     def position(self) -> Array:
@@ -63,6 +64,7 @@ def open_result(
     rig: Path | None = None,
     topics: Topics | None = None,
     params: EstimatorParams | None = None,
+    preset: str = "voting",
     out: Path | None = None,
     jobs: int = 1,
     on_pair: Callable[[], None] = lambda: None,
@@ -80,9 +82,16 @@ def open_result(
     views = resolve_views(recording, resolved)
     allowed = unlabelled(recording, views.camera, out)
     estimated = estimate_from_images(
-        recording, views, params or EstimatorParams(), allowed, out=out, jobs=jobs, on_pair=on_pair
+        recording,
+        views,
+        params or EstimatorParams(),
+        allowed,
+        preset=preset,
+        out=out,
+        jobs=jobs,
+        on_pair=on_pair,
     )
-    return Result(recording, resolved, views, estimated)
+    return Result(recording, resolved, views, estimated, preset)
 
 
 def export_urdf(result: Result, path: Path, *, overwrite: bool = False) -> None:

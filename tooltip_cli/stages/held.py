@@ -31,6 +31,7 @@ class HeldFrame:
     frame: int  # running number of the image
     poses: Array  # (3, 4, 4) camera_from_hand of the image and its partners
     displacements: tuple[float, float]  # pixels that a tool's end moves by to them
+    level: int  # how often images were halved for that to fit the search window
     edges: FrameEdges
     root_from_camera: Array  # (3, 3) how the camera is turned
     message: Message
@@ -78,9 +79,9 @@ class HeldEstimator:
             + [item.poses[1:] for item in held]
         )
         moved = np.array([item.displacements for item in held]).reshape(-1, 2)
-        reason = check_motion(
-            Pairing(numbers, partners, moved, snapshot.fastest_px), poses, settings
-        )
+        levels = np.array([item.level for item in held], dtype=np.intp)
+        pairing = Pairing(numbers, partners, moved, snapshot.fastest_px, levels)
+        reason = check_motion(pairing, poses, settings)
         if reason is not None:
             return refused(METHOD, count, reason)
         turned = np.stack([item.root_from_camera for item in held])

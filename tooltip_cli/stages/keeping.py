@@ -153,32 +153,33 @@ class FrameKeeper:
         if decided.partners is None:
             return
         point = orientations(image.camera_from_hand[None])[0]
-        place = self._spread.place_for(point)
+        place = self._spread.place_for(point, decided.level)
         if place is None:
             return
         if late:
             self.passed_over += 1
             return
-        edges = self._edges(decided.frame, decided.partners)
+        edges = self._edges(decided.frame, decided.partners, decided.level)
         if edges is None:
             self.unreadable += 1
             return
         poses = np.stack(
             [self._window[i].camera_from_hand for i in (decided.frame, *decided.partners)]
         )
-        self._spread.put(place, point)
+        self._spread.put(place, point, decided.level)
         assert image.message is not None  # noqa: S101 - images are kept
         self._held[place] = HeldFrame(
             decided.frame,
             poses,
             decided.displacements,
+            decided.level,
             edges,
             image.root_from_camera,
             _packed(image.message, decided.frame),
         )
         self.changes += 1
 
-    def _edges(self, frame: int, partners: tuple[int, int]) -> FrameEdges | None:
+    def _edges(self, frame: int, partners: tuple[int, int], level: int) -> FrameEdges | None:
         """Return an image's moving edges; None: it or a partner cannot be read."""
         params = self._settings.moving
         images = []
@@ -204,7 +205,7 @@ class FrameKeeper:
         centres, radii = hand_in_image(view, np.zeros(1, dtype=np.intp), params.reach)
         noise = float(np.median(self._noise))
         return moving_edges(
-            images[0], (images[1], images[2]), centres[0], float(radii[0]), noise, params
+            images[0], (images[1], images[2]), centres[0], float(radii[0]), noise, params, level
         )
 
     def _known_camera(self) -> CameraModel:

@@ -52,6 +52,7 @@ class Protocol:
     params: EstimatorParams = field(default_factory=EstimatorParams)
     detector: DetectorParams = field(default_factory=DetectorParams)
     curve: bool | None = None  # estimate from fewer training frames too; None: as far as is quick
+    preset: str = "voting"  # detections near the hand; or paper: among all edges
 
 
 @dataclass(frozen=True)

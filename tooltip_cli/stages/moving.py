@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.log.detections import read_provenance
@@ -20,6 +21,8 @@ from tooltip_cli.method.voting.moving import (
     FrameEdges,
     Image,
     MovingEdges,
+    canny_thresholds,
+    image_edges,
     join,
     moving_edges,
     noise_level,
@@ -148,6 +151,8 @@ def known_edges(
         "hand": digest(np.round(np.column_stack([centres, radii]))),
         "turned": digest(np.round(views.root_from_camera[pairing.frames], 4)),
     }
+    if pairing.levels.any():  # where all are matched whole, as before there were levels
+        parents["levels"] = digest(pairing.levels)
     key = stage_key("edges", VERSION, parents, params)
     if not force:
         for place in known_places(recording.path, SUFFIX, out):
@@ -196,8 +201,8 @@ class FramesJob:
         self, recording: Recording, views: Views, pairing: Pairing, settings: VotingSettings
     ) -> None:
         lap = laps()
-        noise = _noise(recording, pairing)
-        lap("decode")
+        noise = noise_in(recording, noise_frames(pairing, len(views.stamps_ns)))
+        lap("noise")
         scene = Scene(recording, views, pairing.frames, settings.silhouette)
         lap("background")
         self.on_frame: Callable[[], None] = lambda: None
@@ -212,7 +217,10 @@ class FramesJob:
     def part(self, start: int, stop: int) -> _SomeFrames:
         """Return the chosen ones of some images."""
         rows = slice(*np.searchsorted(self._pairing.frames, [start, stop]))
-        return _SomeFrames(self._finder, self._pairing.frames[rows], self._pairing.partners[rows])
+        pairing = self._pairing
+        return _SomeFrames(
+            self._finder, pairing.frames[rows], pairing.partners[rows], pairing.levels[rows]
+        )
 
     def add(self, result: list[FrameEdges]) -> None:
         """Take the edges of some frames."""
@@ -235,17 +243,41 @@ class _Finder:
     params: MovingParams
 
 
+class Look:
+    """A smoothed image, and its edges once somebody asks."""
+
+    def __init__(self, gray: Image, params: MovingParams) -> None:
+        self.smoothed = smooth(gray, params)
+        self._params = params
+        self._edges: dict[tuple[int, int], npt.NDArray[np.int32]] = {}
+
+    def edges(self, noise: float) -> npt.NDArray[np.int32]:
+        """Return the edges (N, 2) that stand out from so much noise, grey levels."""
+        thresholds = canny_thresholds(noise, self._params)
+        if thresholds not in self._edges:
+            self._edges[thresholds] = image_edges(self.smoothed, thresholds, self._params)
+        return self._edges[thresholds]
+
+
+def look_at(image: LoggedImage, gray: Image, params: MovingParams) -> Look:
+    """Return the look that all jobs share, given the image's grey levels."""
+    return image.once((Look, params), lambda: Look(gray, params))
+
+
 class _SomeFrames:
-    """Some chosen frames (F,) with their partners (F, 2), before and after.
+    """Some chosen frames (F,) with their partners (F, 2), before and after, and levels (F,).
 
     Memory: the images from a frame's first partner to its second.
     """
 
-    def __init__(self, finder: _Finder, frames: Indices, partners: Indices) -> None:
+    def __init__(
+        self, finder: _Finder, frames: Indices, partners: Indices, levels: Indices
+    ) -> None:
         self.wanted = frozenset(map(int, (*frames, *partners.ravel())))
         self._finder, self._frames, self._partners = finder, frames, partners
+        self._levels = levels
         self._centres, self._radii = hand_in_image(finder.views, frames, finder.params.reach)
-        self._smoothed: dict[int, Image] = {}
+        self._looks: dict[int, Look] = {}
         self._silhouettes: list[FrameSilhouette] = []
         self._found: list[FrameEdges] = []
 
@@ -253,8 +285,8 @@ class _SomeFrames:
         """Look at a frame or a partner."""
         gray = image.gray
         lap("decode")
-        self._smoothed[index] = smooth(gray, self._finder.params)
-        lap("moving edges")
+        self._looks[index] = look_at(image, gray, self._finder.params)
+        lap("smooth")
         if index in self._frames:
             colour = image.decode(gray=False)
             lap("decode")
@@ -264,8 +296,8 @@ class _SomeFrames:
         while len(self._found) < len(self._frames) and self._last_of_next() <= index:
             self._found.append(self._next())
             wanted = self._partners[len(self._found) :]
-            for past in [i for i in self._smoothed if not len(wanted) or i < wanted.min()]:
-                del self._smoothed[past]
+            for past in [i for i in self._looks if not len(wanted) or i < wanted.min()]:
+                del self._looks[past]
         lap("moving edges")
 
     def result(self) -> list[FrameEdges]:
@@ -277,23 +309,37 @@ class _SomeFrames:
 
     def _next(self) -> FrameEdges:
         row = len(self._found)
-        before, after = (self._smoothed[int(index)] for index in self._partners[row])
+        look = self._looks[int(self._frames[row])]
+        before, after = (self._looks[int(index)].smoothed for index in self._partners[row])
         edges = moving_edges(
-            self._smoothed[int(self._frames[row])],
+            look.smoothed,
             (before, after),
             self._centres[row],
             float(self._radii[row]),
             self._finder.noise,
             self._finder.params,
+            int(self._levels[row]),
+            look.edges(self._finder.noise),
         )
         return replace(edges, silhouette=self._silhouettes[row])
 
 
-def _noise(recording: Recording, pairing: Pairing) -> float:
-    """Estimate the sensor noise from chosen frames and their partners, evenly spread."""
-    rows = np.unique(np.linspace(0, len(pairing.frames) - 1, _NOISE_PAIRS).astype(int))
-    wanted = [i for row in rows for i in (pairing.frames[row], pairing.partners[row, 1])]
-    images = list(recording.images(wanted, gray=True))
+def noise_frames(pairing: Pairing, count: int) -> Indices:
+    """Return (P, 2) chosen frames and their later partners, evenly spread, that show the noise.
+
+    Where none are chosen, neighbours among all ``count`` images show it.
+    """
+    firsts, seconds = pairing.frames, pairing.partners[:, 1]
+    if not len(firsts):
+        firsts, seconds = np.arange(count - 1), np.arange(1, count)
+    few = min(_NOISE_PAIRS, len(firsts))
+    rows = np.linspace(0, len(firsts) - 1, few).astype(int)
+    return np.stack([firsts[rows], seconds[rows]], axis=1)
+
+
+def noise_in(recording: Recording, pairs: Indices) -> float:
+    """Estimate the sensor noise from (P, 2) pairs of images, grey levels."""
+    images = list(recording.images(pairs.ravel(), gray=True))
     return noise_level(list(zip(images[::2], images[1::2], strict=True)))
 
 

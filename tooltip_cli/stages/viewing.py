@@ -37,6 +37,7 @@ from tooltip_cli.stages.detect import Detected, detect_in
 from tooltip_cli.stages.estimate import estimation_input
 from tooltip_cli.stages.export import Result
 from tooltip_cli.stages.held_out import LABELS_SUFFIX
+from tooltip_cli.stages.near import near_unless
 
 PREDICTION_TOPIC = "/tooltip/prediction_annotations"
 LABEL_TOPIC = "/tooltip/label_annotations"
@@ -85,7 +86,8 @@ def export_log(
     """
     check_absent(path, overwrite=overwrite)
     recording = result.recording
-    detected = detect_in(recording, out=out, jobs=jobs, on_pair=on_pair)
+    near = near_unless(result.preset, recording, result.views)
+    detected = detect_in(recording, near=near, out=out, jobs=jobs, on_pair=on_pair)
     exported = Exported(path, detected=detected)
     beside = _BesideImages(result, detected, out)
     with LogWriter(path, overwrite=overwrite) as writer:

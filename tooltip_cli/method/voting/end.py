@@ -176,10 +176,10 @@ def locate_far_side(shape: Shape, far: Array, spheres: Array, params: EndParams)
     inside = across < params.wide**2
     top = float(np.quantile(along[inside], 0.98)) if inside.any() else 0.0
     last = inside & (along > top - params.middle_slab)
-    radius = float(np.sqrt(across[last].mean())) if last.any() else 0.0
-    return ToolEnd(
-        position + axis * (top - 0.5 * params.voxel), axis, max(radius, _LEAST_RADIUS), 0.0
-    )
+    # twice the root mean square, about as far as it goes: other starts look at narrow ends
+    radius = 2.0 * float(np.sqrt(across[last].mean())) if last.any() else 0.0
+    position = position + axis * (top - 0.5 * params.voxel)
+    return ToolEnd(position, axis, max(radius, _LEAST_RADIUS), 0.0)
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ import numpy as np
 
 from tooltip_cli.method.rays import angular_spread
 from tooltip_cli.method.types import Array, Candidate, Reason, TipEstimate, refused
-from tooltip_cli.method.voting.pairing import Pairing
-from tooltip_cli.method.voting.params import TrustParams, VotingSettings
+from tooltip_cli.method.voting.pairing import Pairing, displacement, probe_pixels
+from tooltip_cli.method.voting.params import PairingParams, TrustParams, VotingSettings
 
 if TYPE_CHECKING:
     from tooltip_cli.method.voting.volume import Cloud, HandEdges
@@ -32,11 +32,12 @@ def check_motion(
         )
     if count >= trust.min_frames:
         return None
-    if pairing.fastest_px > settings.pairing.displacement_px:
+    params = settings.pairing
+    if pairing.fastest_px > params.smallest * params.displacement_px:
         return Reason(
             "too_fast",
             f"a tool's end moves by about {pairing.fastest_px:.0f} pixels between images, and at "
-            f"most {settings.pairing.max_displacement_px:.0f} can be followed, which only "
+            f"most {params.fastest_px:.0f} can be followed, which only "
             f"{count} frames keep to; turn the wrist more slowly, or record at a higher rate",
         )
     return Reason(
@@ -73,6 +74,8 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     if not len(shape.voxels):
         clutter = cloud.consistent < trust.min_consistent
         return refused(METHOD, used, _nothing_consistent(cloud) if clutter else _only_the_hand())
+    if cloud.consistent < trust.fast_consistent and _halved(edges, settings.pairing):
+        return refused(METHOD, used, _nothing_consistent(cloud))
     found = find_ends(edges, cloud, shape, spheres, settings)
     if cloud.consistent < trust.min_consistent and found[0].agreement < trust.convincing_agreement:
         return refused(METHOD, used, _nothing_consistent(cloud))
@@ -96,6 +99,17 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
 def preferred(candidates: list[Candidate], direction: Array) -> Candidate:
     """Return the candidate that lies farthest in a direction (3,), hand frame."""
     return max(candidates, key=lambda item: float(item.position @ direction))
+
+
+def _halved(edges: HandEdges, params: PairingParams) -> bool:
+    """Return whether the motion between partners is too far for whole images.
+
+    Matches of smaller images are less certain, so more of them fit a hand that moves otherwise.
+    """
+    probes = probe_pixels(edges.camera_from_hand, edges.focal_px, params)
+    moving = edges.moving
+    moved = displacement(probes[moving.frames][:, None], probes[moving.partners])
+    return bool((moved > params.max_displacement_px).any())
 
 
 def _hidden(position: Array, edges: HandEdges, trust: TrustParams) -> Reason | None:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from tooltip_cli.method.affine import fit_background, mahalanobis
-from tooltip_cli.method.blocks import match_blocks, window_margin
+from tooltip_cli.method.blocks import BlockMatches, match_blocks, window_margin
 from tooltip_cli.method.canny import edge_points
-from tooltip_cli.method.types import Array, Indices
+from tooltip_cli.method.types import Array, Indices, Mask
 from tooltip_cli.method.voting.params import MovingParams
 from tooltip_cli.method.voting.silhouette import FrameSilhouette, Silhouettes, join_silhouettes
 
@@ -87,9 +88,11 @@ def noise_level(pairs: list[tuple[Image, Image]]) -> float:
     Returns:
         Grey levels; at least half of one, which is rounding.
     """
+    import cv2
+
     levels = []
     for first, second in pairs:
-        difference = np.abs(first.astype(np.int16) - second.astype(np.int16))
+        difference = np.asarray(cv2.absdiff(first, second))
         # the median of integers is too coarse at low noise: interpolate its histogram
         share = np.cumsum(np.bincount(difference.ravel(), minlength=2)) / difference.size
         level = int(np.searchsorted(share, 0.5))
@@ -106,6 +109,33 @@ def smooth(image: Image, params: MovingParams) -> Image:
     return np.asarray(cv2.GaussianBlur(image, (0, 0), params.blur_px), dtype=np.uint8)
 
 
+def halve(image: Image, times: int) -> Image:
+    """Return the image halved so often; pixel (u, v) lies at 2^times (u, v) in what is given."""
+    import cv2
+
+    for _ in range(times):
+        image = np.asarray(cv2.pyrDown(image), dtype=np.uint8)
+    return image
+
+
+def canny_thresholds(noise: float, params: MovingParams) -> tuple[int, int]:
+    """Return the thresholds of edges in smoothed images; Canny takes whole numbers.
+
+    Args:
+        noise: of the raw images, grey levels.
+    """
+    low = params.canny_low * max(noise, 1.0)
+    return math.floor(low), math.floor(low * params.canny_ratio)
+
+
+def image_edges(
+    image: Image, thresholds: tuple[int, int], params: MovingParams
+) -> npt.NDArray[np.int32]:
+    """Find the edges of one image (H, W) gray, smoothed; (N, 2) u, v, row by row."""
+    margin = window_margin(params.block, params.search)
+    return np.array(edge_points(image, *thresholds, margin))  # without the room for more
+
+
 def moving_edges(
     image: Image,
     others: tuple[Image, Image],
@@ -113,6 +143,8 @@ def moving_edges(
     hand_radius_px: float,
     noise: float,
     params: MovingParams,
+    level: int = 0,
+    edges: npt.NDArray[np.int32] | None = None,
 ) -> FrameEdges:
     """Find the edges of one image that move against the background to either partner.
 
@@ -121,49 +153,64 @@ def moving_edges(
         hand_pixel: (2,) where the hand's origin projects.
         hand_radius_px: how far from there the tool can reach.
         noise: of the raw images, grey levels.
+        level: how often images are halved for the motion to fit the search window; matches that
+            are found there are made exact on the whole images.
+        edges: (N, 2) u, v, where they are known, see `image_edges`.
     """
-    low = params.canny_low * max(noise, 1.0)
-    margin = window_margin(params.block, params.search)
-    edges = edge_points(image, low, low * params.canny_ratio, margin)
+    if edges is None:
+        edges = image_edges(image, canny_thresholds(noise, params), params)
+    scale = 2**level
+    if level:
+        edges = _inside(
+            edges, scale * window_margin(params.block, params.search) + scale // 2, image
+        )
     affines = np.full((2, 2, 3), np.nan)
     if len(edges) < _FLAT:
         return _nothing(affines)
-    du, dv = edges[:, 0] - hand_pixel[0], edges[:, 1] - hand_pixel[1]
-    # a mask as an index takes ten times as long with rows of two
-    near = np.compress(du * du + dv * dv < hand_radius_px**2, edges, axis=0)
-    place = near[:, 1] * image.shape[1] + near[:, 0]  # in all pixels, row by row
-    changed = np.zeros(len(near), dtype=bool)
+    differs = np.zeros(image.shape, dtype=bool)
     sample = _sample(edges, params)
-    for side, other in enumerate(others):
-        model = _background(image, other, sample, params)
-        if model is None:
+    small = halve(image, level)
+    pairs = [_Pair(image, other, small, halve(other, level), scale, params) for other in others]
+    for side, (other, pair) in enumerate(zip(others, pairs, strict=True)):
+        matches = pair.match(sample)
+        fit = fit_background(sample, matches.translations, matches.covariances)
+        if fit is None:
             return _nothing(affines)
-        affines[side] = model
-        changed |= _changed(image, other, model, noise, params).ravel().take(place)
-    edges = np.compress(changed, near, axis=0)
-    matches = [
-        match_blocks(
-            image,
-            other,
-            edges,
-            block=params.block,
-            search=params.search,
-            tau=params.tau,
-            alpha=params.alpha,
-        )
-        for other in others
-    ]
+        affines[side] = fit.model
+        differs |= changed(image, other, fit.model, noise, params)
+    edges = within(on_mask(differs, edges), hand_pixel, hand_radius_px)
+    found = [pair.match(edges) for pair in pairs]
     weights = [
         mahalanobis(model, edges, match.translations, match.covariances)
-        for model, match in zip(affines, matches, strict=True)
+        for model, match in zip(affines, found, strict=True)
     ]
     moving = np.maximum(*weights) > params.min_weight
     return FrameEdges(
         affines,
         edges[moving].astype(np.uint16),
-        np.stack([match.translations[moving] for match in matches], axis=1).astype(np.int8),
-        np.stack([match.covariances[moving] for match in matches], axis=1).astype(np.float32),
+        np.stack([match.translations[moving] for match in found], axis=1).astype(np.int8),
+        np.stack([match.covariances[moving] for match in found], axis=1).astype(np.float32),
     )
+
+
+def _inside(edges: npt.NDArray[np.int32], margin: int, image: Image) -> npt.NDArray[np.int32]:
+    """Return the edges (N, 2) that are at least so many pixels inside an image's border."""
+    height, width = image.shape
+    least, most = edges.min(axis=1), np.array([width, height]) - margin
+    return np.compress((least >= margin) & (edges < most).all(axis=1), edges, axis=0)
+
+
+def on_mask(mask: Mask, edges: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Return the edges (N, 2) at which a mask (H, W) is true."""
+    place = edges[:, 1] * mask.shape[1] + edges[:, 0]  # in all pixels, row by row
+    # a mask as an index takes ten times as long with rows of two
+    return np.compress(mask.ravel().take(place), edges, axis=0)
+
+
+def within(edges: npt.NDArray[np.int32], pixel: Array, radius_px: float) -> npt.NDArray[np.int32]:
+    """Return the edges (N, 2) that are less than so far from a pixel (2,)."""
+    du, dv = edges[:, 0] - pixel[0], edges[:, 1] - pixel[1]
+    return np.compress(du * du + dv * dv < radius_px**2, edges, axis=0)
 
 
 def _sample(edges: npt.NDArray[np.int32], params: MovingParams) -> npt.NDArray[np.int32]:
@@ -175,27 +222,58 @@ def _sample(edges: npt.NDArray[np.int32], params: MovingParams) -> npt.NDArray[n
     return np.ascontiguousarray(edges[np.sort(rows)])
 
 
-def _background(
-    image: Image, other: Image, sample: npt.NDArray[np.int32], params: MovingParams
-) -> Array | None:
-    """Fit the background's affine motion to a sample of all edges."""
-    matches = match_blocks(
-        image,
-        other,
-        sample,
-        block=params.block,
-        search=params.search,
-        tau=params.tau,
-        alpha=params.alpha,
-    )
-    fit = fit_background(sample, matches.translations, matches.covariances)
-    return None if fit is None else fit.model
+@dataclass(frozen=True)
+class _Pair:
+    """An image and a partner, whole and so small that the motion fits the search window."""
+
+    image: Image
+    other: Image
+    small_image: Image
+    small_other: Image
+    scale: int  # of the whole ones to the small ones
+    params: MovingParams
+
+    def match(self, edges: npt.NDArray[np.int32]) -> BlockMatches:
+        """Find the edges again: roughly in the small images, and about there in the whole ones.
+
+        Of several matches that the small images could not tell apart, the whole ones see one only.
+        So its covariance is that of both, but for the part that all matches have.
+        """
+        scale, alpha = self.scale, self.params.alpha
+        at = (edges + scale // 2) // scale
+        rough = self._match(self.small_image, self.small_other, at, self.params.search)
+        if scale == 1:
+            return rough
+        about = scale * rough.translations
+        exact = self._match(self.image, self.other, edges, 2 * scale + 1, about)
+        unsure = scale**2 * (rough.covariances - alpha * np.array([1.0, 0.0, 1.0]))
+        return replace(exact, covariances=exact.covariances + unsure)
+
+    def _match(
+        self,
+        image: Image,
+        other: Image,
+        edges: npt.NDArray[np.int32],
+        search: int,
+        offsets: npt.NDArray[np.int32] | None = None,
+    ) -> BlockMatches:
+        params = self.params
+        return match_blocks(
+            image,
+            other,
+            edges,
+            block=params.block,
+            search=search,
+            tau=params.tau,
+            alpha=params.alpha,
+            offsets=offsets,
+        )
 
 
-def _changed(
+def changed(
     image: Image, other: Image, model: Array, noise: float, params: MovingParams
 ) -> npt.NDArray[np.bool_]:
-    """Return (H, W) where the images differ after the background's motion is undone."""
+    """Return (H, W) where smoothed images differ after the background's motion is undone."""
     import cv2
 
     height, width = image.shape

@@ -21,6 +21,7 @@ class Decided:
     frame: int  # running number of the image
     partners: tuple[int, int] | None  # images before and after; None: it cannot be used
     displacements: tuple[float, float]  # pixels that the probes move by
+    level: int  # how often images are halved for that to fit the search window; -1: no partners
 
 
 class CausalPairing:
@@ -69,14 +70,15 @@ class CausalPairing:
         frames, first = range(self._decided, until), self.oldest
         self._decided = until
         rows = np.arange(frames.start, frames.stop) - first
-        partners, moved = find_partners(np.array(self._probes), rows, self._params)
+        partners, moved, levels = find_partners(np.array(self._probes), rows, self._params)
         return [
             Decided(
                 frame,
                 (first + int(pair[0]), first + int(pair[1])) if (pair >= 0).all() else None,
                 (float(pixels[0]), float(pixels[1])),
+                int(level),
             )
-            for frame, pair, pixels in zip(frames, partners, moved, strict=True)
+            for frame, pair, pixels, level in zip(frames, partners, moved, levels, strict=True)
         ]
 
 
@@ -84,7 +86,9 @@ class Spread:
     """Keeps a bounded number of points far from one another, as they come.
 
     While there is room everything is kept. Afterwards a point that is farther from all than the two
-    closest are from each other takes the place of one of these two.
+    closest are from each other takes the place of one of these two. A point of a lower rank is
+    always kept before one of a higher: it takes such a one's place, and only among those of the
+    highest rank are others given up for their distance.
 
     Args:
         capacity: points that are kept.
@@ -93,6 +97,7 @@ class Spread:
 
     def __init__(self, capacity: int, dimensions: int) -> None:
         self._points = np.zeros((capacity, dimensions))
+        self._ranks = np.zeros(capacity, dtype=np.intp)
         self._distances = np.full((capacity, capacity), np.inf)
         self._count = 0
 
@@ -101,20 +106,28 @@ class Spread:
         """Whether every further point takes the place of another."""
         return self._count == len(self._points)
 
-    def place_for(self, point: Array) -> int | None:
+    def place_for(self, point: Array, rank: int = 0) -> int | None:
         """Return the place that a point (D,) should take; None: it would not spread them more."""
         if not self.full:
             return self._count
-        first, second = divmod(int(np.argmin(self._distances)), len(self._points))
-        if self._to_all(point).min() <= self._distances[first, second]:
+        worst = int(self._ranks.max())
+        if rank > worst:
             return None
+        replaceable = np.flatnonzero(self._ranks == worst)
+        distances = self._distances[replaceable]
+        row, second = divmod(int(np.argmin(distances)), len(self._points))
+        first = int(replaceable[row])
+        if rank == worst and self._to_all(point).min() <= distances[row, second]:
+            return None
+        if self._ranks[second] < worst:
+            return first
         # of the two, the one that has another near it as well is missed less
         others = np.sort(self._distances[[first, second]], axis=1)[:, 1]
         return first if others[0] <= others[1] else second
 
-    def put(self, place: int, point: Array) -> None:
+    def put(self, place: int, point: Array, rank: int = 0) -> None:
         """Put a point (D,) where :meth:`place_for` said."""
-        self._points[place] = point
+        self._points[place], self._ranks[place] = point, rank
         self._count = max(self._count, place + 1)
         distances = self._to_all(point)
         distances[self._count :] = np.inf

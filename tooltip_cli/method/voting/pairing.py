@@ -11,6 +11,7 @@ from tooltip_cli.method.types import Array, Indices, Mask
 from tooltip_cli.method.voting.params import PairingParams
 
 _ROWS_AT_ONCE = 512  # images whose partners are looked for together; bounds memory
+_NONE_KEPT: Indices = np.zeros(0, dtype=np.intp)
 _PROBE_QUANTILE = 0.75  # of the probes' displacements: those on the axis of rotation never move
 
 
@@ -22,6 +23,7 @@ class Pairing:
     partners: Indices  # (F, 2) image indices before and after
     displacements: Array  # (F, 2) pixels that the probes move by
     fastest_px: float  # median motion of the probes between consecutive frames, pixels
+    levels: Indices  # (F,) how often images are halved, for the motion to fit the search window
 
 
 def pair_frames(
@@ -31,6 +33,8 @@ def pair_frames(
 
     For every frame, the partner on either side is the one to which points at a tool's distance
     from the hand move nearest to the wanted displacement. Frames without both are not used.
+    Where that leaves fewer frames than are wanted, because even neighbouring images are too far
+    apart, others are paired for images half the size, and then a quarter.
 
     Args:
         camera_from_hand: (N, 4, 4); NaN where the hand's pose is unknown.
@@ -41,25 +45,50 @@ def pair_frames(
     if allowed is not None:
         camera_from_hand = np.where(allowed[:, None, None], camera_from_hand, np.nan)
     probes = probe_pixels(camera_from_hand, focal_px, params)
-    partners, moved = find_partners(probes, np.arange(count), params)
+    partners, moved, levels = find_partners(probes, np.arange(count), params)
     consecutive = displacement(probes[:-1], probes[1:])
     consecutive = consecutive[np.isfinite(consecutive)]
-    paired = np.asarray((partners >= 0).all(axis=1))
-    chosen = farthest_points(orientations(camera_from_hand), paired, params.frames)
+    features = orientations(camera_from_hand)
+    chosen = np.zeros(0, dtype=np.intp)
+    for level in range(params.levels):
+        usable = np.asarray((levels >= 0) & (levels <= level))
+        chosen = farthest_points(features, usable, params.frames, chosen)
     fastest = float(np.median(consecutive)) if len(consecutive) else 0.0
-    return Pairing(chosen, partners[chosen], moved[chosen], fastest)
+    return Pairing(chosen, partners[chosen], moved[chosen], fastest, levels[chosen])
 
 
-def find_partners(probes: Array, rows: Indices, params: PairingParams) -> tuple[Indices, Array]:
+def find_partners(
+    probes: Array, rows: Indices, params: PairingParams
+) -> tuple[Indices, Array, Indices]:
     """Find the images to which the probes move nearest to the wanted displacement.
+
+    That displacement, its least and its most are those of images as large as can be for there to
+    be a partner on either side.
 
     Args:
         probes: (N, S, 2) the probes' pixels in consecutive images; NaN where they are unknown.
         rows: (R,) images that partners are looked for.
 
     Returns:
-        (R, 2) images before and after, -1: none; and (R, 2) pixels that the probes move by.
+        (R, 2) images before and after; (R, 2) pixels that the probes move by; and (R,) how often
+        images are halved for that motion to fit the search window, -1: there are no partners.
     """
+    partners = np.full((len(rows), 2), -1, dtype=np.intp)
+    moved = np.zeros((len(rows), 2))
+    levels = np.full(len(rows), -1, dtype=np.intp)
+    for level in range(params.levels):
+        left = np.flatnonzero(levels < 0)
+        pairs, pixels = _partners_at(probes, rows[left], 2.0**level, params)
+        found = np.asarray((pairs >= 0).all(axis=1))
+        at = left[found]
+        partners[at], moved[at], levels[at] = pairs[found], pixels[found], level
+    return partners, moved, levels
+
+
+def _partners_at(
+    probes: Array, rows: Indices, scale: float, params: PairingParams
+) -> tuple[Indices, Array]:
+    """Return (R, 2) the images to either side, -1: none, and (R, 2) pixels that probes move by."""
     count, gaps = len(probes), np.arange(1, params.max_gap + 1)
     partners = np.full((len(rows), 2), -1, dtype=np.intp)
     moved = np.zeros((len(rows), 2))
@@ -72,11 +101,11 @@ def find_partners(probes: Array, rows: Indices, params: PairingParams) -> tuple[
             pixels = displacement(first, second)
             usable = (
                 inside
-                & (pixels >= params.min_displacement_px)
-                & (pixels <= params.max_displacement_px)
+                & (pixels >= scale * params.min_displacement_px)
+                & (pixels <= scale * params.max_displacement_px)
             )
             with np.errstate(divide="ignore", invalid="ignore"):
-                cost = np.abs(np.log(pixels / params.displacement_px))
+                cost = np.abs(np.log(pixels / (scale * params.displacement_px)))
             best = np.argmin(np.where(usable, cost, np.inf), axis=1)
             found = np.flatnonzero(usable.any(axis=1))
             partners[start + found, side] = others[found, best[found]]
@@ -94,11 +123,14 @@ def orientations(camera_from_hand: Array) -> Array:
     return camera_from_hand[:, :3, :3].reshape(-1, 9)
 
 
-def farthest_points(features: Array, usable: Mask, count: int) -> Indices:
+def farthest_points(
+    features: Array, usable: Mask, count: int, kept: Indices = _NONE_KEPT
+) -> Indices:
     """Choose rows far from one another (farthest-point sampling), from the first usable one on.
 
     Args:
         features: (N, D).
+        kept: usable rows, at most ``count``, that are chosen already.
 
     Returns:
         At most ``count`` ascending indices of usable rows.
@@ -108,13 +140,14 @@ def farthest_points(features: Array, usable: Mask, count: int) -> Indices:
         return candidates
     points = features[candidates]
     distances = np.full(len(points), np.inf)
-    chosen = [0]
+    start = np.searchsorted(candidates, kept).tolist() or [0]
+    chosen: list[int] = []
     while len(chosen) < count:
-        last = chosen[-1]
+        last = start[len(chosen)] if len(chosen) < len(start) else int(np.argmax(distances))
+        chosen.append(last)
         distances = np.minimum(distances, np.linalg.norm(points - points[last], axis=1))
         distances[last] = -1.0  # where all others are the same, none is chosen twice
-        chosen.append(int(np.argmax(distances)))
-    return np.sort(candidates[np.array(chosen)])
+    return np.sort(candidates[np.array(chosen, dtype=np.intp)])
 
 
 def _probe_points(radius: float) -> Array:

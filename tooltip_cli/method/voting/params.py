@@ -11,10 +11,21 @@ class PairingParams:
 
     frames: int = 200  # at most, spread over the hand's orientations
     probe_radius: float = 0.15  # metres from the hand's origin: where a tool's end is expected
-    displacement_px: float = 4.5  # wanted motion of such points between partners
+    displacement_px: float = 4.5  # wanted motion of such points between partners, whole images
     min_displacement_px: float = 2.0  # less shows nothing
     max_displacement_px: float = 7.0  # more leaves the search window
     max_gap: int = 15  # frames between partners
+    levels: int = 3  # sizes of images, each half the one before, that are matched until it fits
+
+    @property
+    def smallest(self) -> int:
+        """How many times smaller the smallest images are than whole ones."""
+        return int(2 ** (self.levels - 1))
+
+    @property
+    def fastest_px(self) -> float:
+        """Most that such points may move by between neighbouring images."""
+        return self.smallest * self.max_displacement_px
 
 
 @dataclass(frozen=True)
@@ -186,6 +197,7 @@ class TrustParams:
     min_score: float = 0.6  # best share of expected frames in which a voxel was seen
     min_consistent: float = 0.55  # share of moving edges that fit something fixed to the hand
     convincing_agreement: float = 0.65  # of frames on the end: with it, less may be consistent
+    fast_consistent: float = 0.65  # as min_consistent, with any agreement, where images are halved
     doubtful_agreement: float = 0.6  # of what images show of the end: less is said
     doubtful_std: float = 0.005  # metres, of the end in any direction: more is said
     min_in_view: float = 0.5  # share of the frames in which the tip lies inside the image

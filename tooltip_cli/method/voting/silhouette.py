@@ -114,7 +114,10 @@ def learn_backdrop(samples: Image, params: SilhouetteParams) -> Backdrop:
     noise = max(float(np.median(spread)), 1.0)
     tolerance = params.tolerance * _GAUSSIAN_PER_MAD * np.maximum(spread, noise)
     tolerance = np.clip(tolerance, params.least_contrast, 254.0)
-    seen = (off <= _MAD_PER_TOLERANCE * tolerance).mean(axis=0)
+    # whole numbers are below what their floor is below, and bytes are counted faster
+    limit = np.minimum(_MAD_PER_TOLERANCE * tolerance, 255.0).astype(np.uint8)
+    counter = np.min_scalar_type(len(off))
+    seen = (off <= limit).view(np.uint8).sum(axis=0, dtype=counter) / len(off)
     unknown = (seen < params.min_seen) | (tolerance > params.most_contrast)
     tolerance = np.where(unknown, NOTHING_KNOWN, np.ceil(tolerance))
     return Backdrop(_blurred(colour), tolerance.astype(np.uint8))

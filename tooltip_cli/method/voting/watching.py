@@ -96,6 +96,6 @@ class MotionWatch:
         code = KEEP_GOING
         if reason.code == "depth_unobservable":
             code = TILT
-        elif now.fastest_px > settings.pairing.max_displacement_px:
+        elif now.fastest_px > settings.pairing.fastest_px:
             code = SLOWER
         return replace(verdict, code=code)

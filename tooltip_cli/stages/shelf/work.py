@@ -28,6 +28,7 @@ from tooltip_cli.stages.evaluate import VERSION as EVALUATE_VERSION
 from tooltip_cli.stages.evaluate import Places, evaluate_recording
 from tooltip_cli.stages.measure import Protocol
 from tooltip_cli.stages.moving import VERSION as EDGES_VERSION
+from tooltip_cli.stages.near import VERSION as NEAR_VERSION
 from tooltip_cli.stages.shelf.plan import Item
 from tooltip_cli.stages.shelf.scratch import Bench, at_hand
 from tooltip_cli.stages.shelf.store import Place, Remote, Seen, look_at, place, read_some, write
@@ -35,7 +36,14 @@ from tooltip_cli.stages.shelf.table import FAILED, OK, Row, row_from_document
 
 ROW = "row.json"
 VERSION = 2
-VERSIONS = (VERSION, DETECT_VERSION, EDGES_VERSION, ESTIMATE_VERSION, EVALUATE_VERSION)
+VERSIONS = (
+    VERSION,
+    DETECT_VERSION,
+    NEAR_VERSION,
+    EDGES_VERSION,
+    ESTIMATE_VERSION,
+    EVALUATE_VERSION,
+)
 """Of everything that a row is made by; a row of other versions is made anew."""
 _LOGGER = logging.getLogger(__name__)
 
