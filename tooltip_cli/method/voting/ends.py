@@ -202,8 +202,10 @@ def first_end(edges: HandEdges, spheres: Array, settings: VotingSettings) -> Clo
         return None
     rough, *others = _rough_ends(edges, cloud, shape, spheres, settings)
     refine = settings.refine
+    # with such a loss many ends explain the images as well: the best is taken
+    alone = replace(settings, outline=replace(settings.outline, as_good=1.0))
     found = _outline_fit(
-        edges, rough, spheres, settings, replace(refine, loss_px=refine.first_loss_px)
+        edges, rough, spheres, alone, replace(refine, loss_px=refine.first_loss_px)
     )
     if found is not None and edges.silhouettes is not None:
         fit, _ = found
