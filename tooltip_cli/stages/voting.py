@@ -105,7 +105,7 @@ def hand_edges(
     views: Views, moving: MovingEdges, camera_from_hand: Array, settings: VotingSettings
 ) -> HandEdges:
     """Undo the lens distortion of moving edges, their matches and the background's motion."""
-    camera = views.camera
+    camera, moving = views.camera, moving.in_order()
     pixels = moving.pixels.astype(float)
     affines = moving.affines[moving.frame_of_edge]
     carried = np.einsum("ekij,ej->eki", affines[..., :2], pixels) + affines[..., 2]
