@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tooltip_cli.method.affine import fit_background
-from tooltip_cli.method.blocks import match_blocks, window_margin
+from tooltip_cli.method.blocks import BlockMatches, match_blocks, window_margin
 from tooltip_cli.method.canny import edge_points
 from tooltip_cli.method.types import Array, TipPixels
 
@@ -97,6 +97,19 @@ def find_edges(image: Image, params: DetectorParams) -> Edges:
     return edge_points(image, params.canny_low, params.canny_high, margin)
 
 
+def match_edges(first: Image, second: Image, edges: Edges, params: DetectorParams) -> BlockMatches:
+    """Find edges (N, 2) of one image (H, W), gray, again in the next."""
+    return match_blocks(
+        first,
+        second,
+        edges,
+        block=params.block,
+        search=params.search,
+        tau=params.tau,
+        alpha=params.alpha,
+    )
+
+
 def not_asked(step: str) -> None:
     """Nobody wants to know that a step has ended."""
 
@@ -117,15 +130,7 @@ def edge_motion(
     """
     if len(edges) < params.min_edges:
         return FEW_EDGES
-    matches = match_blocks(
-        first,
-        second,
-        edges,
-        block=params.block,
-        search=params.search,
-        tau=params.tau,
-        alpha=params.alpha,
-    )
+    matches = match_edges(first, second, edges, params)
     lap("match")
     fit = fit_background(
         edges,

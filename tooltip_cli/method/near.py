@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tooltip_cli.method.affine import fit_background, mahalanobis
-from tooltip_cli.method.blocks import BlockMatches, match_blocks, matchable, window_margin
+from tooltip_cli.method.blocks import matchable, window_margin
 from tooltip_cli.method.detector import (
     FEW_EDGES,
     SINGULAR,
@@ -22,6 +22,7 @@ from tooltip_cli.method.detector import (
     Image,
     TipDetection,
     heaviest,
+    match_edges,
     no_detection,
     not_asked,
 )
@@ -73,7 +74,7 @@ def near_motion(
         return FEW_EDGES
     step = max(len(edges) // params.background_edges, 1)
     sample = _with_room(np.ascontiguousarray(edges[::step]), first, params)
-    matches = _matched(first, second, sample, detector)
+    matches = match_edges(first.gray, second.gray, sample, detector)
     lap("match")
     fit = fit_background(
         sample,
@@ -91,23 +92,11 @@ def near_motion(
         near = within(near, hand[:2], hand[2])
     near = _with_room(near, first, params)
     lap("changes")
-    matches = _matched(first, second, near, detector)
+    matches = match_edges(first.gray, second.gray, near, detector)
     weights = mahalanobis(fit.model, near, matches.translations, matches.covariances)
     lap("match")
     return EdgeMotion(
         near, matches.translations, matches.covariances, weights, fit.inliers, fit.model
-    )
-
-
-def _matched(first: Shown, second: Shown, edges: Edges, params: DetectorParams) -> BlockMatches:
-    return match_blocks(
-        first.gray,
-        second.gray,
-        edges,
-        block=params.block,
-        search=params.search,
-        tau=params.tau,
-        alpha=params.alpha,
     )
 
 

@@ -123,7 +123,7 @@ def locate_end(
     cloud: Cloud, shape: Shape, far: Array, spheres: Array, params: EndParams
 ) -> ToolEnd:
     """Find axis and middle of the end that ``far`` (3,), metres, lies on."""
-    outwards = _unit(far - grip_of(spheres))
+    outwards = unit_vector(far - grip_of(spheres))
     near = shape.voxels[np.linalg.norm(shape.voxels - far, axis=1) < params.neighbourhood] - far
     axis = _slender_axis(near, _cone(outwards, params.cone_deg), outwards, params)
     axis = _slender_axis(near, _cone(axis, params.refine_deg), outwards, params)
@@ -144,16 +144,14 @@ def locate_end(
 
 def locate_hull_end(shape: Shape, far: Array, spheres: Array, params: EndParams) -> ToolEnd:
     """Find axis and middle of the end of a solid that ``far`` (3,), metres, lies on, roughly."""
-    outwards = _unit(far - grip_of(spheres))
+    outwards = unit_vector(far - grip_of(spheres))
     near = shape.voxels[np.linalg.norm(shape.voxels - far, axis=1) < params.neighbourhood] - far
     few = near[:: max(1, len(near) // _SOLID_VOXELS)]
     axis = _slender_axis(few, _cone(outwards, params.cone_deg), outwards, params)
     axis = _slender_axis(few, _cone(axis, params.refine_deg), outwards, params)
     middle = far + _middle(near, axis, params.slab_radius, params)
     radius = _radius(few, axis, params)
-    about = shape.voxels - middle
-    along = about @ axis
-    across = np.square(about).sum(axis=1) - along * along
+    along, across = _along_axis(shape.voxels - middle, axis)
     core = across <= max(radius, 1.5 * params.voxel) ** 2
     top = float(np.quantile(along[core], 0.98)) if core.any() else 0.0
     return ToolEnd(middle + axis * (top - 0.5 * params.voxel), axis, radius, 0.0)
@@ -169,11 +167,10 @@ def locate_far_side(shape: Shape, far: Array, spheres: Array, params: EndParams)
     near = shape.voxels[np.linalg.norm(shape.voxels - far, axis=1) < params.neighbourhood]
     position = far
     for _ in range(_FAR_SIDE_ROUNDS):
-        axis = _unit(position - grip)
+        axis = unit_vector(position - grip)
         position = position + _middle(near - position, axis, params.wide, params)
-    axis = _unit(position - grip)
-    along = (near - position) @ axis
-    across = np.square(near - position).sum(axis=1) - along * along
+    axis = unit_vector(position - grip)
+    along, across = _along_axis(near - position, axis)
     inside = across < params.wide**2
     top = float(np.quantile(along[inside], 0.98)) if inside.any() else 0.0
     last = inside & (along > top - params.middle_slab)
@@ -293,9 +290,7 @@ def end_along(cloud: Cloud, middle: Array, axis: Array, radius: float) -> float:
     The density of points along the axis is a plateau that stops, with the end's rim upon it, both
     blurred: the place of the stop is fitted together with their heights and the blur.
     """
-    about = cloud.points - middle
-    along = about @ axis
-    across = np.square(about).sum(axis=1) - along * along
+    along, across = _along_axis(cloud.points - middle, axis)
     inside = (across < max(0.02, 1.6 * radius) ** 2) & (along > -0.06) & (along < 0.04)
     bins = np.round(along[inside] / _BIN).astype(np.int64) + 60
     span = cloud.frame_count
@@ -358,6 +353,13 @@ def _cone(axis: Array, degrees: float) -> Array:
     return cone
 
 
-def _unit(vector: Array) -> Array:
+def _along_axis(about: Array, axis: Array) -> tuple[Array, Array]:
+    """Return how far points (V, 3) lie along an axis (3,), metres, and from it, metres squared."""
+    along = about @ axis
+    return along, np.square(about).sum(axis=1) - along * along
+
+
+def unit_vector(vector: Array) -> Array:
+    """Return a vector (3,) of length 1; where it has none, that along z."""
     length = float(np.linalg.norm(vector))
     return vector / length if length > 0 else np.array([0.0, 0.0, 1.0])

@@ -51,8 +51,11 @@ class MovingEdges:
 
     def in_order(self) -> MovingEdges:
         """Return the same with each frame's edges row by row: sums of them come out the same."""
-        place = self.pixels[:, 1].astype(np.int64) << 16 | self.pixels[:, 0]
-        edge = np.lexsort((place, self.frame_of_edge))
+        rows, columns = self.pixels[:, 1].astype(np.int64), self.pixels[:, 0]
+        place = self.frame_of_edge << 32 | rows << 16 | columns
+        if (place[1:] > place[:-1]).all():  # as they are found
+            return self
+        edge = np.argsort(place, kind="stable")
         return replace(
             self,
             pixels=self.pixels[edge],

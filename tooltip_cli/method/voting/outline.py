@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tooltip_cli.method.types import Array
-from tooltip_cli.method.voting.end import ToolEnd
+from tooltip_cli.method.voting.end import ToolEnd, unit_vector
 from tooltip_cli.method.voting.hull import missing
 from tooltip_cli.method.voting.params import OutlineParams, RefineParams
 from tooltip_cli.method.voting.refine import Fit, first_as_good, fit_end, looked_at, turned_axes
@@ -89,7 +89,7 @@ def _starts(
         axes = [
             end.axis,
             *turned_axes(end.axis, refine.start_turn_deg),
-            _unit(end.position - grip),
+            unit_vector(end.position - grip),
         ]
         factors = [it for it in params.radius_factors if it >= 1 or not end.wide]
         for factor in factors:
@@ -162,7 +162,7 @@ def _scatter(best: Fit, fits: Sequence[tuple[_Start, Fit]], grip: Array) -> floa
 
 def _outwards(fit: Fit, grip: Array) -> float:
     """Return the cosine of the angle between the end's axis and the way to it from the grip."""
-    return float(_unit(fit.position - grip) @ fit.axis)
+    return float(unit_vector(fit.position - grip) @ fit.axis)
 
 
 def _unlike(tried: Sequence[tuple[_Start, Fit]], params: OutlineParams) -> list[_Start]:
@@ -210,7 +210,3 @@ def _at_point(
     behind = pointed.position - params.beside_depth * fit.axis
     beside = missing(silhouettes, behind + np.outer([0.5, 1.0], aside))
     return pointed if beside.max() > params.min_missing_beside else fit
-
-
-def _unit(vector: Array) -> Array:
-    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-9))
