@@ -111,7 +111,7 @@ def _detect_one(
     has_rig = rig is not None or "rig.yaml" in recording.attachments
     near, edges = None, None
     if preset == "voting" and has_rig:
-        near, edges = _by_rig(recording, rig, out, force)
+        near, edges = _by_rig(recording, rig, out, force, jobs)
     along = [edges.job] if isinstance(edges, PendingEdges) else []
     with progress(len(recording.image_stamps_ns) - 1, f"detect {path.name}") as advance:
         found = detect_in(
@@ -147,7 +147,7 @@ def _detect_one(
 
 
 def _by_rig(
-    recording: Recording, rig: Path | None, out: Path | None, force: bool
+    recording: Recording, rig: Path | None, out: Path | None, force: bool, jobs: int
 ) -> tuple[NearHand, DetectedEdges | PendingEdges | Reason]:
     """Return where the hand is, and the moving edges, what finds them, or why there are none."""
     from tooltip_cli.log.views import resolve_rig, resolve_views
@@ -160,7 +160,8 @@ def _by_rig(
     views = resolve_views(recording, resolve_rig(recording, rig))
     near = near_hand(recording, views)
     lap("poses")
-    return near, edges_for_voting(recording, views, VotingSettings(), out=out, force=force)
+    settings = VotingSettings()
+    return near, edges_for_voting(recording, views, settings, out=out, force=force, jobs=jobs)
 
 
 def _finished(path: Path, edges: DetectedEdges | PendingEdges | Reason, jobs: int) -> str | None:

@@ -33,6 +33,20 @@ _SMALL_TYPES = (messages.JOINT_STATE, messages.POSE_STAMPED, messages.CAMERA_INF
 _CACHED_CHUNKS = 4
 
 
+class _Made:
+    """What was made of something, for others who want the same."""
+
+    def __init__(self) -> None:
+        self._by_key: dict[Hashable, Any] = {}
+
+    def once(self, key: Hashable, make: Callable[[], _T]) -> _T:
+        """Return what ``make`` returned to the first who asked for ``key``."""
+        if key not in self._by_key:
+            self._by_key[key] = make()
+        made: _T = self._by_key[key]
+        return made
+
+
 @dataclass(frozen=True)
 class Topics:
     """Which topic to take for each role; None: the only one of its type."""
@@ -81,6 +95,11 @@ class Recording:
     notes: tuple[str, ...]  # what was odd: duplicates, reversals, unreadable messages
     unusable: Mapping[str, str]  # joints, info, robot or a pose topic -> why it is left out
     _places: tuple[tuple[int, int, int], ...] = field(repr=False)  # chunk, offset, length
+    _made: _Made = field(default_factory=_Made, repr=False, compare=False)
+
+    def once(self, key: Hashable, make: Callable[[], _T]) -> _T:
+        """Return what ``make`` returned to the first who asked this recording for ``key``."""
+        return self._made.once(key, make)
 
     def images(self, indices: Iterable[int], *, gray: bool = False) -> Iterator[Image]:
         """Yield decoded images by index, (H, W, 3) BGR or (H, W) gray, uint8, of one size.
@@ -129,14 +148,7 @@ class LoggedImage:
     ) -> None:
         self._recording, self._index, self._message = recording, index, message
         self._sizes = sizes
-        self._made: dict[Hashable, Any] = {}
-
-    def once(self, key: Hashable, make: Callable[[], _T]) -> _T:
-        """Return what ``make`` returned to the first who asked this image for ``key``."""
-        if key not in self._made:
-            self._made[key] = make()
-        made: _T = self._made[key]
-        return made
+        self.once = _Made().once
 
     @cached_property
     def gray(self) -> Image:

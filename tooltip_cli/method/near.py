@@ -27,7 +27,7 @@ from tooltip_cli.method.detector import (
     not_asked,
 )
 from tooltip_cli.method.types import Array
-from tooltip_cli.method.voting.moving import changed, on_mask, within
+from tooltip_cli.method.voting.moving import changed, every_so_many, on_mask, within
 from tooltip_cli.method.voting.params import MovingParams
 
 
@@ -72,8 +72,7 @@ def near_motion(
     detector = params.detector
     if len(edges) < detector.min_edges:
         return FEW_EDGES
-    step = max(len(edges) // params.background_edges, 1)
-    sample = _with_room(np.ascontiguousarray(edges[::step]), first, params)
+    sample = _with_room(every_so_many(edges, params.background_edges), first, params)
     matches = match_edges(first.gray, second.gray, sample, detector)
     lap("match")
     fit = fit_background(

@@ -46,7 +46,7 @@ from tooltip_cli.stages.passes import look_through
 from tooltip_cli.stages.scene import Scene
 
 SUFFIX = ".edges.mcap"
-VERSION = 3
+VERSION = 4
 _NOISE_PAIRS = 8
 _LOGGER = logging.getLogger(__name__)
 
@@ -122,7 +122,7 @@ def detect_edges_in(
     Raises:
         TooltipError: an image cannot be decoded, or the artifact not written.
     """
-    found = known_edges(recording, views, pairing, settings, out=out, force=force)
+    found = known_edges(recording, views, pairing, settings, out=out, force=force, jobs=jobs)
     return found if isinstance(found, DetectedEdges) else found.finish(jobs, on_frame)
 
 
@@ -134,6 +134,7 @@ def known_edges(
     *,
     out: Path | None = None,
     force: bool = False,
+    jobs: int = 1,
 ) -> DetectedEdges | PendingEdges:
     """Return the edges that are stored, or what will find them; see `detect_edges_in`.
 
@@ -159,7 +160,7 @@ def known_edges(
             stored = _stored(place, key, recording)
             if stored is not None:
                 return DetectedEdges(place, key, True, stored)
-    job = FramesJob(recording, views, pairing, settings)
+    job = FramesJob(recording, views, pairing, settings, jobs)
     return PendingEdges(recording, artifact_path(recording.path, SUFFIX, out), key, params, job)
 
 
@@ -183,7 +184,7 @@ def find_moving_edges(
     jobs: int,
 ) -> MovingEdges:
     """Find the edges and silhouettes of all chosen frames; they do not depend on ``jobs``."""
-    job = FramesJob(recording, views, pairing, settings)
+    job = FramesJob(recording, views, pairing, settings, jobs)
     look_through(recording, [job], jobs)
     return job.edges()
 
@@ -198,12 +199,17 @@ class FramesJob:
     """
 
     def __init__(
-        self, recording: Recording, views: Views, pairing: Pairing, settings: VotingSettings
+        self,
+        recording: Recording,
+        views: Views,
+        pairing: Pairing,
+        settings: VotingSettings,
+        jobs: int,
     ) -> None:
         lap = laps()
         noise = noise_in(recording, noise_frames(pairing, len(views.stamps_ns)))
         lap("noise")
-        scene = Scene(recording, views, pairing.frames, settings.silhouette)
+        scene = Scene(recording, views, pairing.frames, settings.silhouette, jobs)
         lap("background")
         self.on_frame: Callable[[], None] = lambda: None
         self._pairing, self._found = pairing, list[FrameEdges]()
@@ -339,8 +345,12 @@ def noise_frames(pairing: Pairing, count: int) -> Indices:
 
 def noise_in(recording: Recording, pairs: Indices) -> float:
     """Estimate the sensor noise from (P, 2) pairs of images, grey levels."""
-    images = list(recording.images(pairs.ravel(), gray=True))
-    return noise_level(list(zip(images[::2], images[1::2], strict=True)))
+
+    def estimate() -> float:
+        images = list(recording.images(pairs.ravel(), gray=True))
+        return noise_level(list(zip(images[::2], images[1::2], strict=True)))
+
+    return recording.once((noise_in, pairs.tobytes()), estimate)
 
 
 def hand_in_image(views: Views, frames: Indices, reach: float) -> tuple[Array, Array]:

@@ -21,11 +21,13 @@ from tooltip_cli.method.voting.silhouette import (
     silhouette,
 )
 from tooltip_cli.rig.camera import CameraModel
+from tooltip_cli.stages.threads import in_order
 
 Map = npt.NDArray[np.float32]
 
 _MEMORY = 100_000_000  # bytes that all samples may take together
 _FEWEST_SAMPLES = 9
+_DECODED_AT_ONCE = 4
 _STILL_PX = 2.0  # less is what joint encoders make up: turning images by it would blur the scene
 _GRID = (33, 25)  # columns and rows at which a camera's turn is computed, the rest interpolated
 _OUTSIDE = -1e4  # a pixel that no image has
@@ -46,9 +48,18 @@ class Scene:
     """
 
     def __init__(
-        self, pictures: ColourImages, views: Views, frames: Indices, params: SilhouetteParams
+        self,
+        pictures: ColourImages,
+        views: Views,
+        frames: Indices,
+        params: SilhouetteParams,
+        jobs: int = 1,
     ) -> None:
         """Learn the scene from some of the frames, image indices.
+
+        Args:
+            jobs: threads, each of which asks ``pictures`` for images; the scene does not depend
+                on them.
 
         Raises:
             TooltipError: an image cannot be decoded.
@@ -59,13 +70,22 @@ class Scene:
         count = min(params.samples, max(count, _FEWEST_SAMPLES), len(frames))
         chosen = frames[np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
         samples = np.empty(0, np.uint8)
-        for row, (index, image) in enumerate(zip(chosen, pictures.images(chosen), strict=True)):
+        starts = range(0, len(chosen), _DECODED_AT_ONCE)
+        seen = in_order(lambda start: self._seen(chosen[start:][:_DECODED_AT_ONCE]), starts, jobs)
+        for row, image in enumerate(seen):
             if not row:  # filled in place, as a second copy of so much memory would count
-                samples = np.empty((len(chosen), *_channels(image).shape), np.uint8)
-            # pixels of the reference, looked up in this image
-            turn = self._turn(views.root_from_camera[index], self._reference)
-            samples[row] = _channels(image if turn is None else _looked_up(image, turn))
+                samples = np.empty((len(chosen), *image.shape), np.uint8)
+            samples[row] = image
         self._backdrop = learn_backdrop(samples, params)
+
+    def _seen(self, frames: Indices) -> list[Image]:
+        """Return (H, W, C) images as the camera would see them from its reference pose."""
+        seen = []
+        for index, image in zip(frames, self._pictures.images(frames), strict=True):
+            # pixels of the reference, looked up in this image
+            turn = self._turn(self._views.root_from_camera[index], self._reference)
+            seen.append(_channels(image if turn is None else _looked_up(image, turn)))
+        return seen
 
     def silhouette(
         self, image: Image, root_from_camera: npt.NDArray[np.float64]

@@ -85,6 +85,7 @@ def edges_for_voting(
     *,
     out: Path | None = None,
     force: bool = False,
+    jobs: int = 1,
 ) -> DetectedEdges | PendingEdges | Reason:
     """Return the moving edges that the estimate will ask for, or what will find them.
 
@@ -98,7 +99,7 @@ def edges_for_voting(
     reason = check_motion(pairing, camera_from_hand, settings)
     if reason is not None:
         return reason
-    return known_edges(recording, views, pairing, settings, out=out, force=force)
+    return known_edges(recording, views, pairing, settings, out=out, force=force, jobs=jobs)
 
 
 def hand_edges(

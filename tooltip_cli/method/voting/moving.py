@@ -182,7 +182,7 @@ def moving_edges(
     if len(edges) < _FLAT:
         return _nothing(affines)
     differs = np.zeros(image.shape, dtype=bool)
-    sample = _sample(edges, params)
+    sample = every_so_many(edges, params.background_edges)
     small = halve(image, level)
     pairs = [_Pair(image, other, small, halve(other, level), scale, params) for other in others]
     for side, (other, pair) in enumerate(zip(others, pairs, strict=True)):
@@ -227,13 +227,9 @@ def within(edges: npt.NDArray[np.int32], pixel: Array, radius_px: float) -> npt.
     return np.compress(du * du + dv * dv < radius_px**2, edges, axis=0)
 
 
-def _sample(edges: npt.NDArray[np.int32], params: MovingParams) -> npt.NDArray[np.int32]:
-    """Return a seeded sample of all edges."""
-    if len(edges) <= params.background_edges:
-        return edges
-    rng = np.random.default_rng(params.seed)
-    rows = rng.choice(len(edges), params.background_edges, replace=False)
-    return np.ascontiguousarray(edges[np.sort(rows)])
+def every_so_many(edges: npt.NDArray[np.int32], count: int) -> npt.NDArray[np.int32]:
+    """Return about ``count`` of the edges (N, 2), evenly spread over their order."""
+    return np.ascontiguousarray(edges[:: max(len(edges) // count, 1)])
 
 
 @dataclass(frozen=True)

@@ -39,11 +39,10 @@ class MovingParams:
     blur_px: float = 1.0  # standard deviation of the Gaussian that tames sensor noise
     canny_low: float = 20.0  # on the blurred image, at a noise of one grey level or less
     canny_ratio: float = 2.5  # high threshold over low
-    background_edges: int = 2000  # sample that the background's motion is fitted to
+    background_edges: int = 2000  # about so many, row by row, that the background is fitted to
     change: float = 4.0  # grey levels that a pixel near a moving edge changes by, at least
     min_weight: float = 2.0  # Mahalanobis distance to the background
     reach: float = 0.35  # metres from the hand's origin: where the tool can be
-    seed: int = 0  # of the sample
 
 
 @dataclass(frozen=True)
