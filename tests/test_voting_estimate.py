@@ -241,12 +241,22 @@ def test_fast_motion_must_be_more_consistent(speed: float, trusted: bool) -> Non
     edges = view(TIP, wrong=0.3, speed=speed)
     share = reconstruct(edges, SETTINGS.voting).consistent
     assert share > SETTINGS.trust.min_consistent
+    never = replace(SETTINGS.trust, convincing_agreement=1.01)
     for limit, accepted in ((share + 0.05, trusted), (share - 0.05, True)):
-        trust = replace(SETTINGS.trust, fast_consistent=limit)
-        settings = replace(SETTINGS, trust=trust)
+        settings = replace(SETTINGS, trust=replace(never, fast_consistent=limit))
         found = estimate_by_voting(edges, SPHERES, settings)
         assert (found.status == "ok") == accepted
         assert accepted or refusal_of(found) == "inconsistent_views"
+
+
+def test_an_end_on_which_the_images_agree_is_no_clutter() -> None:
+    """A camera that turns fast makes much move that is not on the hand, and the end is as sharp."""
+    edges = view(TIP, wrong=0.3, speed=5.0)
+    strict = replace(SETTINGS.trust, fast_consistent=1.0)
+    found = estimate_by_voting(edges, SPHERES, replace(SETTINGS, trust=strict))
+    assert found.status == "ok"
+    assert found.position is not None
+    assert np.linalg.norm(found.position - TIP) < 0.003
 
 
 def test_poses_of_other_images_are_refused() -> None:

@@ -138,7 +138,10 @@ def _rough_ends(
             near = [end for at, end, _ in votes if np.linalg.norm(at - far) < same]
             solid = [
                 locate_hull_end(sure, far, spheres, params),
-                locate_far_side(sure, far, spheres, params),
+                *(
+                    locate_far_side(sure, far, spheres, replace(params, middle_slab=slab))
+                    for slab in params.far_slabs
+                ),
             ]
             solid += [
                 locate_hull_end(hull, bulge, spheres, params)

@@ -71,13 +71,12 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     trust = settings.trust
     if cloud.score < trust.min_score:
         return refused(METHOD, used, _nothing_consistent(cloud))
+    halved = _halved(edges, settings.pairing)
+    clutter = cloud.consistent < (trust.fast_consistent if halved else trust.min_consistent)
     if not len(shape.voxels):
-        clutter = cloud.consistent < trust.min_consistent
         return refused(METHOD, used, _nothing_consistent(cloud) if clutter else _only_the_hand())
-    if cloud.consistent < trust.fast_consistent and _halved(edges, settings.pairing):
-        return refused(METHOD, used, _nothing_consistent(cloud))
     found = find_ends(edges, cloud, shape, spheres, settings)
-    if cloud.consistent < trust.min_consistent and found[0].agreement < trust.convincing_agreement:
+    if clutter and found[0].agreement < trust.convincing_agreement:
         return refused(METHOD, used, _nothing_consistent(cloud))
     candidates = [end.candidate for end in found]
     if settings.prefer is not None:

@@ -112,6 +112,8 @@ class EndParams:
     face_turn_weight: float = 0.6
     face_gain: float = 1.3  # how much sharper an end face must be to turn the axis far
     middle_slab: float = 0.012  # the stretch whose middle is the tip
+    # the same of a far side: of a slanted one the first holds a piece of the rim only
+    far_slabs: tuple[float, ...] = (0.012, 0.03)
     side_quantile: float = 0.03  # what lies farther out does not make a side
     surface_voxel: float = 0.003
     surface_frames: int = 3
@@ -125,7 +127,7 @@ class RefineParams:
     """
 
     reach: float = 0.05  # how far back from the end edges are looked at
-    beyond: float = 0.03  # how far beyond it
+    beyond: float = 0.06  # how far beyond it: a slanted end's rim lies as far as the end is wide
     max_move: float = 0.012  # from the voted end; what moves farther has found something else
     min_ratio: float = 0.5  # log-likelihood ratio, at the tool's depth, of an edge that counts
     min_sine: float = 0.35  # of the angle between axis and line of sight
@@ -195,8 +197,8 @@ class TrustParams:
     min_view_angle_deg: float = 15.0  # between the camera's directions, seen from the hand
     min_score: float = 0.6  # best share of expected frames in which a voxel was seen
     min_consistent: float = 0.55  # share of moving edges that fit something fixed to the hand
+    fast_consistent: float = 0.65  # the same where images are halved
     convincing_agreement: float = 0.65  # of frames on the end: with it, less may be consistent
-    fast_consistent: float = 0.65  # as min_consistent, with any agreement, where images are halved
     doubtful_agreement: float = 0.6  # of what images show of the end: less is said
     doubtful_std: float = 0.005  # metres, of the end in any direction: more is said
     min_in_view: float = 0.5  # share of the frames in which the tip lies inside the image
