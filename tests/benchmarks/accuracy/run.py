@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import random
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -61,6 +62,27 @@ PERTURBATIONS: dict[str, dict[str, Any]] = {
     "in_plane": {"motion": "in_plane"},
     "still": {"motion": "still"},
 }
+MIXED = "mixed"
+"""Several at once, drawn for each tool and seed from these; of two that contradict, the first."""
+IN_THE_MIX: tuple[dict[str, Any], ...] = (
+    {"noise_sigma": 4.0},
+    {"noise_sigma": 6.0},
+    {"jpeg_quality": 50},
+    {"jpeg_quality": 30},
+    {"head_motion_deg": 2.0},
+    {"head_motion_deg": 4.0},
+    {"background": "clutter"},
+    {"grip_offset_m": 0.02},
+    {"grip_offset_m": -0.02},
+    {"tilt_deg": 20.0},
+    {"tilt_deg": -15.0},
+    {"size": (320, 240)},
+    {"fps": 15.0, "frames": 250},
+    {"time_offset_s": 0.015},
+    {"frames": 250},
+    {"frames": 1000},
+)
+_AT_ONCE = 3
 SMALLER_SPHERES_M = 0.01  # the hand's spheres of ``spheres``, which is otherwise as ``none``
 WRONG = Correction(0.03, np.radians([0.68, -0.57, 0.46]), np.array([0.0030, -0.0030, 0.0027]))
 GOOD_PX = 10.0  # mean error of a run that is worth a warning
@@ -75,7 +97,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, help="directory for what is made")
     parser.add_argument("--tools", nargs="+", default=list(TOOLS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--perturb", nargs="+", default=["none"], choices=list(PERTURBATIONS))
+    parser.add_argument("--perturb", nargs="+", default=["none"], choices=[*PERTURBATIONS, MIXED])
     parser.add_argument("--methods", nargs="+", default=["voting", "kmeans"])
     parser.add_argument("--preset", default="voting", choices=["voting", "paper"])
     parser.add_argument("--wrong", action="store_true", help="make every rig wrong")
@@ -125,11 +147,19 @@ def simulated(
     """Simulate what ``work`` does not hold yet, in the scene of each tool and seed."""
     work.mkdir(parents=True, exist_ok=True)
     for perturbation, seed, tool in itertools.product(perturbations, seeds, tools):
-        changes = {**scene(tool, seed), **PERTURBATIONS[perturbation]}
+        changes = {**scene(tool, seed), **_changes(perturbation, tool, seed)}
         params = replace(SimParams(tool=tool, seed=seed), **changes)
         made = "none" if perturbation == "spheres" else perturbation
         path = work / f"{tool}-{seed}-{made}.mcap"
         yield reuse_simulation(params, path, jobs=2).recording, None, perturbation
+
+
+def _changes(perturbation: str, tool: str, seed: int) -> dict[str, Any]:
+    """Return the parameters that a perturbation changes."""
+    if perturbation != MIXED:
+        return PERTURBATIONS[perturbation]
+    drawn = random.Random(f"{tool}-{seed}").sample(IN_THE_MIX, _AT_ONCE)
+    return {name: value for change in reversed(drawn) for name, value in change.items()}
 
 
 def _score(
