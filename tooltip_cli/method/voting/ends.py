@@ -104,7 +104,8 @@ def _apart(ends: list[FoundEnd], grip: Array, params: EndParams) -> list[FoundEn
     share = params.other_end_support
     best = [end for end in kept if not end.by_grip] or kept
     agreement = share * max(end.agreement for end in best)
-    support = share * max(end.candidate.support for end in best)
+    # votes alone may support what the images do not show: it is no measure of the others
+    support = share * max(it.candidate.support for it in best if it.agreement >= agreement)
     kept = [
         end for end in kept if end.agreement >= agreement and end.candidate.support >= support
     ] or kept[:1]
