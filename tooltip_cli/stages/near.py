@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -34,7 +33,7 @@ class NearHand:
     hands: Array  # (N, 3) u, v and reach around it, whole pixels; NaN: unknown
     noise_frames: Indices  # (P, 2) pairs of images that show the noise
 
-    @cached_property
+    @property
     def noise(self) -> float:
         """Of the recording's images, grey levels.
 

@@ -83,6 +83,7 @@ IN_THE_MIX: tuple[dict[str, Any], ...] = (
     {"frames": 1000},
 )
 _AT_ONCE = 3
+PERTURBATION_NAMES = (*PERTURBATIONS, MIXED)
 SMALLER_SPHERES_M = 0.01  # the hand's spheres of ``spheres``, which is otherwise as ``none``
 WRONG = Correction(0.03, np.radians([0.68, -0.57, 0.46]), np.array([0.0030, -0.0030, 0.0027]))
 GOOD_PX = 10.0  # mean error of a run that is worth a warning
@@ -97,7 +98,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, help="directory for what is made")
     parser.add_argument("--tools", nargs="+", default=list(TOOLS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--perturb", nargs="+", default=["none"], choices=[*PERTURBATIONS, MIXED])
+    parser.add_argument("--perturb", nargs="+", default=["none"], choices=PERTURBATION_NAMES)
     parser.add_argument("--methods", nargs="+", default=["voting", "kmeans"])
     parser.add_argument("--preset", default="voting", choices=["voting", "paper"])
     parser.add_argument("--wrong", action="store_true", help="make every rig wrong")

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.benchmarks.accuracy.more_unseen_tools import MORE_UNSEEN
-from tests.benchmarks.accuracy.run import MIXED, PERTURBATIONS, score_all, simulated
+from tests.benchmarks.accuracy.run import PERTURBATION_NAMES, score_all, simulated
 from tests.benchmarks.accuracy.unseen_tools import UNSEEN
 from tooltip_cli.sources.sim import BACKGROUNDS, params
 from tooltip_cli.sources.sim.tools import HELD
@@ -35,7 +35,7 @@ def main() -> None:
         "--tools", nargs="+", choices=list(ALL), metavar="TOOL", help="instead of a set"
     )
     parser.add_argument("--seeds", nargs="+", type=int, default=[11])
-    parser.add_argument("--perturb", nargs="+", default=["none"], choices=[*PERTURBATIONS, MIXED])
+    parser.add_argument("--perturb", nargs="+", default=["none"], choices=PERTURBATION_NAMES)
     parser.add_argument("--methods", nargs="+", default=["voting"])
     arguments = parser.parse_args()
     HELD.update(ALL)

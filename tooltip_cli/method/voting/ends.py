@@ -141,7 +141,7 @@ def _rough_ends(
                 locate_hull_end(sure, far, spheres, params),
                 *(
                     locate_far_side(sure, far, spheres, replace(params, middle_slab=slab))
-                    for slab in params.far_slabs
+                    for slab in (params.middle_slab, params.slanted_slab)
                 ),
             ]
             solid += [

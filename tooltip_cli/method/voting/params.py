@@ -112,8 +112,7 @@ class EndParams:
     face_turn_weight: float = 0.6
     face_gain: float = 1.3  # how much sharper an end face must be to turn the axis far
     middle_slab: float = 0.012  # the stretch whose middle is the tip
-    # the same of a far side: of a slanted one the first holds a piece of the rim only
-    far_slabs: tuple[float, ...] = (0.012, 0.03)
+    slanted_slab: float = 0.03  # tried for a far side too: a thin one may hold a bit of rim only
     side_quantile: float = 0.03  # what lies farther out does not make a side
     surface_voxel: float = 0.003
     surface_frames: int = 3
