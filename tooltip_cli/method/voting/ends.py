@@ -42,6 +42,7 @@ class FoundEnd:
     candidate: Candidate
     agreement: float  # share of what the images show of it that fits; 0: too few images do
     by_grip: bool = False  # whether only its distance from the grip makes it an end
+    by_outlines: bool = False  # whether silhouettes say where it is, rather than moving edges
 
 
 @dataclass(frozen=True)
@@ -251,7 +252,8 @@ def _by_outlines(
     refined = resampled(fit, settings.refine, settings.trust.seed)
     covariance = refined.position_covariance + doubt * np.eye(3)
     refined = replace(refined, position_covariance=covariance)
-    return _refined(refined, fit.support(settings.refine), settings)
+    found = _refined(refined, fit.support(settings.refine), settings)
+    return replace(found, by_outlines=True)
 
 
 def _by_edges(

@@ -69,14 +69,16 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     cloud = reconstruct(edges, settings.voting)
     shape = tool_shape(cloud, spheres, edges.reach, settings.end)
     trust = settings.trust
-    if cloud.score < trust.min_score:
-        return refused(METHOD, used, _nothing_consistent(cloud))
     halved = _halved(edges, settings.pairing)
     clutter = cloud.consistent < (trust.fast_consistent if halved else trust.min_consistent)
+    faint = cloud.score < trust.min_score
     if not len(shape.voxels):
-        return refused(METHOD, used, _nothing_consistent(cloud) if clutter else _only_the_hand())
+        weak = faint or clutter
+        return refused(METHOD, used, _nothing_consistent(cloud) if weak else _only_the_hand())
     found = find_ends(edges, cloud, shape, spheres, settings)
-    if clutter and found[0].agreement < trust.convincing_agreement:
+    convincing = found[0].agreement >= trust.convincing_agreement
+    # noise hides edges and spoils their matches; silhouettes need neither
+    if (clutter and not convincing) or (faint and not (convincing and found[0].by_outlines)):
         return refused(METHOD, used, _nothing_consistent(cloud))
     candidates = [end.candidate for end in found]
     if settings.prefer is not None:
