@@ -27,6 +27,7 @@ from tooltip_cli.method.detector import (
     not_asked,
 )
 from tooltip_cli.method.types import Array
+from tooltip_cli.method.voting.lighting import dimmed, gain
 from tooltip_cli.method.voting.moving import changed, every_so_many, on_mask, within
 from tooltip_cli.method.voting.params import MovingParams
 
@@ -47,6 +48,11 @@ class Shown:
     gray: Image  # (H, W)
     smoothed: Image  # (H, W)
 
+    def lit_as(self, other: Shown) -> Shown:
+        """Return the same as bright as another image of the same scene."""
+        factor = gain(self.smoothed, other.smoothed)
+        return Shown(dimmed(self.gray, factor), dimmed(self.smoothed, factor))
+
 
 def near_motion(
     first: Shown,
@@ -59,8 +65,8 @@ def near_motion(
 ) -> EdgeMotion | str:
     """Return the weighted map of the edges that may be the tip, or the flag that says why not.
 
-    Blocks are compared as in the paper, in the images as they were. Smoothed are those in which
-    edges and changes are found, so that noise makes up neither.
+    Blocks are compared as in the paper, in the images as they were, but equally bright. Smoothed
+    are those in which edges and changes are found, so that noise makes up neither.
 
     Args:
         edges: (N, 2) of ``first``, smoothed, row by row.
@@ -72,6 +78,7 @@ def near_motion(
     detector = params.detector
     if len(edges) < detector.min_edges:
         return FEW_EDGES
+    second = second.lit_as(first)
     sample = _with_room(every_so_many(edges, params.background_edges), first, params)
     matches = match_edges(first.gray, second.gray, sample, detector)
     lap("match")

@@ -46,7 +46,7 @@ from tooltip_cli.stages.passes import look_through
 from tooltip_cli.stages.scene import Scene
 
 SUFFIX = ".edges.mcap"
-VERSION = 4
+VERSION = 5
 _NOISE_PAIRS = 8
 _LOGGER = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ from tooltip_cli.stages.clock import Lap
 from tooltip_cli.stages.moving import Look, hand_in_image, look_at, noise_frames, noise_in
 from tooltip_cli.stages.voting import pair_views
 
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)

@@ -252,8 +252,8 @@ def _by_outlines(
     refined = resampled(fit, settings.refine, settings.trust.seed)
     covariance = refined.position_covariance + doubt * np.eye(3)
     refined = replace(refined, position_covariance=covariance)
-    found = _refined(refined, fit.support(settings.refine), settings)
-    return replace(found, by_outlines=True)
+    end = _refined(refined, fit.support(settings.refine), settings)
+    return replace(end, by_outlines=True)
 
 
 def _by_edges(

@@ -12,6 +12,7 @@ from tooltip_cli.method.affine import fit_background, mahalanobis
 from tooltip_cli.method.blocks import BlockMatches, match_blocks, window_margin
 from tooltip_cli.method.canny import edge_points
 from tooltip_cli.method.types import Array, Indices, Mask
+from tooltip_cli.method.voting.lighting import evened
 from tooltip_cli.method.voting.params import MovingParams
 from tooltip_cli.method.voting.silhouette import FrameSilhouette, Silhouettes, join_silhouettes
 
@@ -106,7 +107,7 @@ def noise_level(pairs: list[tuple[Image, Image]]) -> float:
 
     levels = []
     for first, second in pairs:
-        difference = np.asarray(cv2.absdiff(first, second))
+        difference = np.asarray(cv2.absdiff(first, evened(second, first)))
         # the median of integers is too coarse at low noise: interpolate its histogram
         share = np.cumsum(np.bincount(difference.ravel(), minlength=2)) / difference.size
         level = int(np.searchsorted(share, 0.5))
@@ -183,6 +184,7 @@ def moving_edges(
         return _nothing(affines)
     differs = np.zeros(image.shape, dtype=bool)
     sample = every_so_many(edges, params.background_edges)
+    others = (evened(others[0], image), evened(others[1], image))
     small = halve(image, level)
     pairs = [_Pair(image, other, small, halve(other, level), scale, params) for other in others]
     for side, (other, pair) in enumerate(zip(others, pairs, strict=True)):

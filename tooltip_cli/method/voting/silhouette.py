@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tooltip_cli.method.types import Array, Indices
+from tooltip_cli.method.voting.lighting import evened
 from tooltip_cli.method.voting.params import SilhouetteParams
 
 Image = npt.NDArray[np.uint8]
@@ -103,10 +104,15 @@ def learn_backdrop(samples: Image, params: SilhouetteParams) -> Backdrop:
     Where hand or tool stand in many of the images, or the scene itself changes, nothing is known.
 
     Args:
-        samples: (S, H, W, C) images, all as seen from one pose of the camera.
+        samples: (S, H, W, C) images, all as seen from one pose of the camera; they are brought to
+            one brightness in place.
     """
     import cv2
 
+    for sample in samples:
+        even = evened(sample, samples[0])
+        if even is not sample:
+            sample[:] = even
     middle = len(samples) // 2
     colour = _ranked(samples, middle)
     off = np.stack([_largest(cv2.absdiff(sample, colour)) for sample in samples])
@@ -147,7 +153,8 @@ def silhouette(image: Image, backdrop: Backdrop, params: SilhouetteParams) -> Fr
     """
     import cv2
 
-    contrast = _largest(cv2.absdiff(_blurred(image), backdrop.colour))
+    image = evened(_blurred(image), backdrop.colour)
+    contrast = _largest(cv2.absdiff(image, backdrop.colour))
     known = backdrop.tolerance != NOTHING_KNOWN
     stands = _without_specks((contrast > backdrop.tolerance) & known, params.min_area)
     if np.count_nonzero(stands) > params.max_share * stands.size:
