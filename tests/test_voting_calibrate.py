@@ -93,6 +93,21 @@ def test_a_camera_that_is_right_is_left_alone() -> None:
     assert not found.applied
 
 
+@pytest.mark.parametrize("camera", [False, True])
+@pytest.mark.parametrize("off", [False, True])
+def test_what_stays_unknown_of_the_rig_is_said_of_the_tip(camera: bool, off: bool) -> None:
+    truth = Correction(0.02, TURN, STEP) if off and camera else Correction()
+    one, other = (recording(truth.time_offset, truth, seed) for seed in (11, 12))
+    found = calibrate([one, other], camera, PARAMS, REFINE)
+    assert found is not None
+    assert len(found.tip_covariances) == 2
+    for covariance in found.tip_covariances:
+        np.testing.assert_allclose(covariance, covariance.T, atol=1e-15)
+        largest = float(np.linalg.eigvalsh(covariance)[-1] ** 0.5)
+        # a camera that is a little farther off looks like a tool that is a little longer
+        assert (1e-4 < largest < 1e-3) if camera else (largest < 5e-5)
+
+
 def test_no_end_is_no_calibration() -> None:
     one = recording(0.0, Correction(), 8)
     assert calibrate([replace(one, position=-TIP)], True, PARAMS, REFINE) is None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -93,6 +93,8 @@ class Refinement:
     applied: bool  # clearly more frames fit with it
     support_before: float  # share of what images could show of the end that fits
     support_after: float
+    # (3, 3) m^2, of each recording's tip: what is still unknown of clocks and camera
+    tip_covariances: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,18 @@ class TipEstimate:
     def status(self) -> str:
         """``ok`` or ``refused``."""
         return "refused" if self.position is None else "ok"
+
+    def less_sure(self, covariance: Array) -> TipEstimate:
+        """Return the same with a covariance (3, 3), m^2, added to all that are known."""
+        return replace(
+            self,
+            covariance=None if self.covariance is None else self.covariance + covariance,
+            candidates=tuple(
+                item if item.covariance is None
+                else replace(item, covariance=item.covariance + covariance)
+                for item in self.candidates
+            ),
+        )  # fmt: skip
 
 
 def refused(method: str, frames_used: int, *reasons: Reason) -> TipEstimate:

@@ -211,7 +211,10 @@ def estimate_from_images(
             put_right=better,
         )
         used.extend([] if edges is None else [edges])
-        return replace(result, refinement=refinements[0] if refinements else None)
+        if not refinements:
+            return result
+        (tip_covariance,) = refinements[0].tip_covariances
+        return replace(result.less_sure(tip_covariance), refinement=refinements[0])
 
     found = _estimate(recording, views, compute, parents, params, out, force)
     return Estimated(*found, used[0] if used else None)

@@ -61,12 +61,43 @@ def calibrate(
         return None
     clocks = _solved(recordings, start, np.array([params.time_prior]), params, refine)
     if not camera:
-        return clocks
+        return _told(recordings, clocks, clocks, refine)
     rotation = np.full(3, np.radians(params.rotation_prior_deg))
     sigmas = np.concatenate([[params.time_prior], rotation, np.full(3, params.translation_prior)])
     both = _solved(recordings, start, sigmas, params, refine)
-    gain = both.support_after - clocks.support_after
-    return both if gain > params.camera_gain else clocks
+    gain = both.found.support_after - clocks.found.support_after
+    used = both if gain > params.camera_gain else clocks
+    return _told(recordings, used, both, refine)
+
+
+@dataclass(frozen=True)
+class _Solution:
+    found: Refinement
+    values: Array  # (K,) offset, rotation and translation, or the offset alone
+    covariance: Array  # (K, K) of them
+    fits: Sequence[Fit | None]  # each recording's end with them
+
+
+def _told(
+    recordings: Sequence[Seen], used: _Solution, full: _Solution, refine: RefineParams
+) -> Refinement:
+    """Return what is used, with what the rest leaves unknown of each recording's tip.
+
+    What the full solution says besides and is not used is in doubt as a whole.
+    """
+    missing = full.values.copy()
+    if used.found.applied:
+        missing[: len(used.values)] -= used.values
+    doubt = full.covariance + np.outer(missing, missing)
+    correction = _correction(full.values)
+    tips = []
+    for seen, fit in zip(recordings, full.fits, strict=True):
+        follow = np.zeros((3, len(missing)))
+        if fit is not None:
+            shared = _shared_derivatives(seen, fit, correction, len(missing))
+            follow = _followed(fit, shared, refine)[3][:3]
+        tips.append(follow @ doubt @ follow.T)
+    return replace(used.found, tip_covariances=tuple(tips))
 
 
 def _fits_without(recordings: Sequence[Seen], refine: RefineParams) -> list[Fit | None]:
@@ -93,22 +124,24 @@ def _solved(
     sigmas: Array,
     params: CalibrationParams,
     refine: RefineParams,
-) -> Refinement:
+) -> _Solution:
     fits, values = start, np.zeros(len(sigmas))
     information, scatter = np.eye(len(sigmas)), np.eye(len(sigmas))
     for index in range(params.rounds):
         loose = _loose(refine, 0.6**index)
         information, scatter, right = _gathered(recordings, fits, values, loose)
-        # in the frames' own terms: robust weights are not inverse variances
+        # in the frames' own terms: robust weights are not inverse variances, and a shape that is
+        # not quite what the equations say is wrong in all frames alike
         variances = sigmas**2
         scale = (np.diag(scatter) @ variances) / max(float(np.diag(information) @ variances), 1e-12)
-        prior = scale * np.diag(1.0 / variances)
+        prior = params.common_error * scale * np.diag(1.0 / variances)
         step = np.linalg.solve(information + prior, right - prior @ values)
         values = values + step
         fits = _refit(recordings, fits, values, loose)
         if np.abs(step / sigmas).max() < params.settled and loose.loss_px <= refine.loss_px:
             break
-    values, deviations, determined = _determined(values, sigmas, information, scatter, params)
+    values, covariance, determined = _determined(values, sigmas, information, scatter, params)
+    deviations = np.sqrt(np.diag(covariance))
     fits = _refit(recordings, fits, values, replace(refine, max_move=_LOOSE_MOVE))
     before, after = (
         float(np.mean([0.0 if fit is None else fit.support(refine) for fit in group]))
@@ -116,7 +149,8 @@ def _solved(
     )
     certain = len(sigmas) > 1 or bool(abs(values[0]) > params.certain * deviations[0])
     helps = determined > 0 and certain and after > before
-    return Refinement(_correction(values), deviations, helps, before, after)
+    found = Refinement(_correction(values), deviations, helps, before, after)
+    return _Solution(found, values, covariance, fits)
 
 
 def _correction(values: Array) -> Correction:
@@ -179,15 +213,23 @@ def _shared_derivatives(seen: Seen, fit: Fit, correction: Correction, size: int)
 
 def _reduced(fit: Fit, shared: Array, refine: RefineParams) -> tuple[Array, Array, Array]:
     """Eliminate a recording's own unknowns from its normal equations."""
+    residuals, weights, own, follow = _followed(fit, shared, refine)
+    free = shared - own @ follow
+    information = shared.T @ (weights * free)
+    scores = np.zeros((int(fit.system.frames.max()) + 1, shared.shape[1]))
+    np.add.at(scores, fit.system.frames, weights * residuals[:, None] * free)
+    return (information + information.T) / 2, scores.T @ scores, scores.sum(axis=0)
+
+
+def _followed(fit: Fit, shared: Array, refine: RefineParams) -> tuple[Array, Array, Array, Array]:
+    """Return (R,) residuals, (R, 1) weights, (R, U) own derivatives of a recording's equations, and
+    (U, K) how its own unknowns follow what recordings share.
+    """
     system = fit.system
     residuals, own = residuals_of(system, fit.unknowns)
     weights = robust_weights(system, residuals, fit.loss, refine)[:, None]
     normal = own.T @ (weights * own) + system.prior.T @ system.prior + 1e-9 * np.eye(own.shape[1])
-    free = shared - own @ np.linalg.solve(normal, own.T @ (weights * shared))
-    information = shared.T @ (weights * free)
-    scores = np.zeros((int(system.frames.max()) + 1, shared.shape[1]))
-    np.add.at(scores, system.frames, weights * residuals[:, None] * free)
-    return (information + information.T) / 2, scores.T @ scores, scores.sum(axis=0)
+    return residuals, weights, own, np.linalg.solve(normal, own.T @ (weights * shared))
 
 
 def _determined(
@@ -196,15 +238,15 @@ def _determined(
     """Keep what the frames determine, in units of what was expected.
 
     Returns:
-        values (K,) without the rest, standard deviations (K,), and how many directions are kept.
+        values (K,) without the rest, their covariance (K, K), and how many directions are kept.
     """
     scaled = np.linalg.inv(information * np.outer(sigmas, sigmas) + 1e-9 * np.eye(len(sigmas)))
-    covariance = scaled @ (scatter * np.outer(sigmas, sigmas)) @ scaled
+    scores = params.common_error * scatter * np.outer(sigmas, sigmas)
+    covariance = scaled @ scores @ scaled
     variances, directions = np.linalg.eigh(covariance)
     known = variances < params.determined**2
     kept = directions[:, known]
     projected = kept @ (kept.T @ (values / sigmas))
     spread = kept @ np.diag(variances[known]) @ kept.T
     rest = np.eye(len(sigmas)) - kept @ kept.T  # left as it was expected
-    deviations = np.sqrt(np.diag(spread + rest)) * sigmas
-    return projected * sigmas, deviations, int(known.sum())
+    return projected * sigmas, (spread + rest) * np.outer(sigmas, sigmas), int(known.sum())

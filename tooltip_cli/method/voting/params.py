@@ -185,6 +185,7 @@ class CalibrationParams:
     settled: float = 0.003  # of those deviations, smallest step worth another round
     certain: float = 3.0  # standard deviations that an offset must have to be used
     camera_gain: float = 0.05  # share of frames that must fit besides, for a camera's correction
+    common_error: float = 10.0  # variance of what is wrong in all frames alike, over that of chance
     determined: float = 0.33  # of those deviations, largest that still determines a direction
 
 
