@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--recordings", nargs="*", type=Path, default=[])
     arguments = parser.parse_args()
     recordings = [path for path in arguments.recordings if len(path.suffixes) == 1]
-    cases = iter([(path, _rig_beside(path), "given") for path in recordings])
+    cases = iter([(path, rig_beside(path), "given") for path in recordings])
     if not arguments.recordings:
         cases = simulated(arguments.work, arguments.tools, arguments.seeds, arguments.perturb)
     score_all(cases, arguments.methods, arguments.work, arguments.wrong, arguments.preset)
@@ -133,7 +133,8 @@ def score_all(
             )
 
 
-def _rig_beside(path: Path) -> Path | None:
+def rig_beside(path: Path) -> Path | None:
+    """Return the rig file beside a recording, if there is one."""
     beside = path.with_suffix(".rig.yaml")
     return beside if beside.exists() else None
 
@@ -182,7 +183,7 @@ def _score(
     labels = match_labels(
         read_labels(path.with_suffix(".labels.csv")), recording.image_stamps_ns, views.camera
     )
-    truth = _truth(path, recording.attachments)
+    truth = true_tip(path, recording.attachments)
     baseline = estimate_from_labels(
         recording, views, labels, EstimatorParams(method="map"), out=out / "labels"
     ).estimate
@@ -215,7 +216,8 @@ def _score(
     return rows
 
 
-def _truth(path: Path, attachments: Any) -> Array | None:
+def true_tip(path: Path, attachments: Any) -> Array | None:
+    """Return the true tip (3,), metres, hand frame, beside or in a recording; None: unknown."""
     beside = path.with_suffix(".truth.json")
     text = beside.read_text() if beside.exists() else attachments.get("truth.json")
     return None if text is None else np.array(json.loads(text)["tip_in_hand_m"])
