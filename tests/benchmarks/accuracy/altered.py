@@ -52,7 +52,7 @@ def _dark(image: Pixels, share: float, rng: Random) -> Pixels:
 
 
 def _drift(image: Pixels, share: float, rng: Random) -> Pixels:
-    return image * np.float32(0.9 + 0.2 * share)
+    return np.asarray(image * (0.9 + 0.2 * share), np.float32)
 
 
 def _blur(image: Pixels, share: float, rng: Random) -> Pixels:
