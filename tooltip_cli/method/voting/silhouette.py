@@ -30,6 +30,7 @@ _MASK_WIDTH = 400  # pixels; masks of wider images are stored at half, a third, 
 _BLUR_PX = 0.8  # standard deviation, of image and backdrop before they are compared
 _BLUR_SIDE = 5  # pixels; further weights are 0, but would be looked at
 _PIXELS_AT_ONCE = 1 << 14  # of all samples, so that they stay close to the processor
+_FEW = 3  # samples that show what blurring takes of the noise
 _PLATEAU_PX = 7  # side of the square in which the contrast at an outline is looked up
 _NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0))  # rows and columns
 _GAUSSIAN_PER_MAD = 1.4826
@@ -125,8 +126,21 @@ def learn_backdrop(samples: Image, params: SilhouetteParams) -> Backdrop:
     counter = np.min_scalar_type(len(off))
     seen = (off <= limit).view(np.uint8).sum(axis=0, dtype=counter) / len(off)
     unknown = (seen < params.min_seen) | (tolerance > params.most_contrast)
+    smoothed = _blurred(colour)
+    tolerance -= params.tolerance * _GAUSSIAN_PER_MAD * noise * _taken(samples, colour, smoothed)
+    tolerance = np.maximum(tolerance, params.least_contrast)
     tolerance = np.where(unknown, NOTHING_KNOWN, np.ceil(tolerance))
-    return Backdrop(_blurred(colour), tolerance.astype(np.uint8))
+    return Backdrop(smoothed, tolerance.astype(np.uint8))
+
+
+def _taken(samples: Image, colour: Image, smoothed: Image) -> float:
+    """Return the part of the noise that blurring takes, with which images are then compared."""
+    import cv2
+
+    few = samples[:: max(len(samples) // _FEW, 1)]
+    raw = np.median([np.median(_largest(cv2.absdiff(it, colour))) for it in few])
+    blurred = np.median([np.median(_largest(cv2.absdiff(_blurred(it), smoothed))) for it in few])
+    return float(max(1.0 - blurred / max(raw, 1.0), 0.0))
 
 
 def _ranked(samples: Image, rank: int) -> Image:
