@@ -31,6 +31,7 @@ _BLUR_PX = 0.8  # standard deviation, of image and backdrop before they are comp
 _BLUR_SIDE = 5  # pixels; further weights are 0, but would be looked at
 _PIXELS_AT_ONCE = 1 << 14  # of all samples, so that they stay close to the processor
 _FEW = 3  # samples that show what blurring takes of the noise
+_FAR_OUT = 0.8  # quantile of the differences that shows it
 _PLATEAU_PX = 7  # side of the square in which the contrast at an outline is looked up
 _NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0))  # rows and columns
 _GAUSSIAN_PER_MAD = 1.4826
@@ -138,9 +139,13 @@ def _taken(samples: Image, colour: Image, smoothed: Image) -> float:
     import cv2
 
     few = samples[:: max(len(samples) // _FEW, 1)]
-    raw = np.median([np.median(_largest(cv2.absdiff(it, colour))) for it in few])
-    blurred = np.median([np.median(_largest(cv2.absdiff(_blurred(it), smoothed))) for it in few])
-    return float(max(1.0 - blurred / max(raw, 1.0), 0.0))
+    # far out, as noise that JPEG makes has long tails; hand and tool cover less than the rest
+    left = [
+        np.quantile(_largest(cv2.absdiff(_blurred(sample), smoothed)), _FAR_OUT)
+        / max(np.quantile(_largest(cv2.absdiff(sample, colour)), _FAR_OUT), 1.0)
+        for sample in few
+    ]
+    return float(max(1.0 - np.median(left), 0.0))
 
 
 def _ranked(samples: Image, rank: int) -> Image:
