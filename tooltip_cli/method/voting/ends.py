@@ -134,7 +134,13 @@ def _rough_ends(
     if silhouettes is not None:
         hull = visual_hull(silhouettes, spheres, edges.reach, settings.hull)
         sure = _confirmed(hull, shape, settings.hull.confirmed)
-        bulges = [hull.voxels[row] for row, _ in _both_ways(hull, grip, settings)]
+        likely = _confirmed(hull, shape, settings.hull.likely)
+        beyond = [(hull, hull.voxels[row], 0.0) for row, _ in _both_ways(hull, grip, settings)]
+        # as far out, what shows no edges, as a pale cap in noise; nearer it is what is sure
+        beyond += [
+            (likely, likely.voxels[row], settings.hull.likely / 2)
+            for row, _ in _both_ways(likely, grip, settings)
+        ]
         for row, by_grip in _both_ways(sure, grip, settings):
             far = sure.voxels[row]
             near = [end for at, end, _ in votes if np.linalg.norm(at - far) < same]
@@ -146,9 +152,9 @@ def _rough_ends(
                 ),
             ]
             solid += [
-                locate_hull_end(hull, bulge, spheres, params)
-                for bulge in bulges
-                if np.linalg.norm(bulge - far) < same
+                locate_hull_end(it, at, spheres, params)
+                for it, at, least in beyond
+                if least <= np.linalg.norm(at - far) < same
             ]
             rough.append(_Rough(far, near[0] if near else None, tuple(solid), by_grip))
     for far, end, by_grip in votes:

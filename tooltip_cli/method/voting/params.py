@@ -69,6 +69,7 @@ class HullParams:
     min_seen: float = 0.3  # share of the images that must say something of a voxel
     max_cover: float = 0.5  # share of the images in which the hand may stand before a pixel
     confirmed: float = 0.012  # from a voted voxel, within which a voxel is surely no bulge
+    likely: float = 0.04  # the same, within which it may be what shows no edges
 
 
 @dataclass(frozen=True)
