@@ -283,6 +283,17 @@ def test_a_wrong_clock_is_put_right(run: Run, tmp_path: Path) -> None:
     assert json.loads(again.out)["refined"] == refined
 
 
+def test_what_is_unknown_of_the_camera_widens_the_tips_region(run: Run, tmp_path: Path) -> None:
+    found = [
+        json.loads(tooltip("estimate", run.recording, *more, "--json", "--out", tmp_path).out)
+        for more in ((), ("--refine", "all", "--force"))
+    ]
+    alone, refined = (np.array(one["tip"]["covariance_m2"]) for one in found)
+    assert np.linalg.eigvalsh(refined)[-1] > np.linalg.eigvalsh(alone)[-1]
+    (first, *_) = found[1]["candidates"]
+    np.testing.assert_allclose(first["covariance_m2"], refined)
+
+
 def test_calibrate_writes_a_rig_that_is_right(run: Run, tmp_path: Path) -> None:
     late = late_rig(run, tmp_path / "late")
     out = tmp_path / "right"

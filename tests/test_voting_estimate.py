@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from tests.helpers.scenes import FOCAL, poses_of
+from tests.test_voting_outline import seen as silhouettes_of
 from tooltip_cli.method.types import Reason, TipEstimate
 from tooltip_cli.method.voting.estimate import METHOD, check_motion, estimate_by_voting
 from tooltip_cli.method.voting.moving import MovingEdges
@@ -257,6 +258,19 @@ def test_an_end_on_which_the_images_agree_is_no_clutter() -> None:
     assert found.status == "ok"
     assert found.position is not None
     assert np.linalg.norm(found.position - TIP) < 0.003
+
+
+def test_silhouettes_show_what_noise_hides_from_votes() -> None:
+    edges = view(TIP, wrong=0.8)
+    assert reconstruct(edges, SETTINGS.voting).score < SETTINGS.trust.min_score
+    assert refusal_of(estimate_by_voting(edges, SPHERES, SETTINGS)) == "inconsistent_views"
+    axis = TIP / np.linalg.norm(TIP)
+    poses = edges.camera_from_hand[edges.moving.frames]
+    outlines = silhouettes_of([(TIP, axis, 0.004, 0.004, 0.16)], poses=poses)
+    found = estimate_by_voting(replace(edges, silhouettes=outlines), SPHERES, SETTINGS)
+    assert found.status == "ok"
+    assert found.position is not None
+    assert np.linalg.norm(found.position - TIP) < 0.002
 
 
 def test_poses_of_other_images_are_refused() -> None:

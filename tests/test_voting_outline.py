@@ -50,11 +50,14 @@ def ball(centre: Array, radius: float) -> Array:
     return np.asarray(centre + radius * points / np.linalg.norm(points, axis=1, keepdims=True))
 
 
-def seen(solids: list[Bar | Array], seed: int = 0, noise_px: float = 0.2) -> HandSilhouettes:
+def seen(
+    solids: list[Bar | Array], seed: int = 0, noise_px: float = 0.2, poses: Array | None = None
+) -> HandSilhouettes:
     """Return exact silhouettes of bars and of convex points, their outlines with noise."""
     rng = np.random.default_rng(seed)
-    poses = poses_of(rng.uniform(-0.9, 0.9, (FRAMES, 3)))
-    masks = np.full((FRAMES, SIZE[1], SIZE[0]), BACKGROUND, np.uint8)
+    if poses is None:
+        poses = poses_of(rng.uniform(-0.9, 0.9, (FRAMES, 3)))
+    masks = np.full((len(poses), SIZE[1], SIZE[0]), BACKGROUND, np.uint8)
     points, rows = [], []
     for row, pose in enumerate(poses):
         hulls = []
