@@ -32,6 +32,8 @@ from tooltip_cli.stages.voting import hand_edges, pair_views
 
 SKIPPED = {"seed"}
 DETECTED = {"pairing", "moving", "silhouette"}
+SHARES = {"as_good", "other_end_support", "other_end_share", "wanted_support", "wanted_share"}
+"""Of the most there is: no more than one."""
 
 
 def main() -> None:
@@ -99,6 +101,8 @@ def _variants(groups: list[str]) -> Iterator[tuple[str, str, str, VotingSettings
                     changed: Any = tuple(item * factor for item in value)
                 else:
                     changed = type(value)(value * factor)
+                if field.name in SHARES:
+                    changed = min(changed, 1.0)
                 if isinstance(value, int) and field.name in ("block", "search"):
                     changed += 1 - changed % 2  # odd
                 if changed == value or not changed:
