@@ -32,6 +32,7 @@ _BLUR_SIDE = 5  # pixels; further weights are 0, but would be looked at
 _PIXELS_AT_ONCE = 1 << 14  # of all samples, so that they stay close to the processor
 _FEW = 3  # samples that show what blurring takes of the noise
 _FAR_OUT = 0.8  # quantile of the differences that shows it
+_NOISE_TAKEN = 0.25  # what blurring takes less of is no noise, but things that are displaced
 _PLATEAU_PX = 7  # side of the square in which the contrast at an outline is looked up
 _NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0))  # rows and columns
 _GAUSSIAN_PER_MAD = 1.4826
@@ -145,7 +146,8 @@ def _taken(samples: Image, colour: Image, smoothed: Image) -> float:
         / max(np.quantile(_largest(cv2.absdiff(sample, colour)), _FAR_OUT), 1.0)
         for sample in few
     ]
-    return float(max(1.0 - np.median(left), 0.0))
+    taken = 1.0 - float(np.median(left))
+    return taken if taken > _NOISE_TAKEN else 0.0
 
 
 def _ranked(samples: Image, rank: int) -> Image:
