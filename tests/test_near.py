@@ -234,7 +234,8 @@ def test_a_hand_that_stands_still_is_looked_at_all_the_same(wrist: Log) -> None:
     still = replace(views, hand_from_camera=views.hand_from_camera[:1].repeat(wrist.frames, axis=0))
     hand = near_hand(recording, still)
     assert (np.diff(hand.noise_frames) == 1).all()
-    assert 0.5 <= hand.noise < 3.0
+    assert 0.5 <= hand.light.noise < 3.0
+    assert hand.light.steady
 
 
 def test_a_frame_in_which_nothing_changed_is_shown_in_the_report(

@@ -62,6 +62,7 @@ def near_motion(
     noise: float,
     params: NearParams,
     lap: Callable[[str], None] = not_asked,
+    steady: bool = False,
 ) -> EdgeMotion | str:
     """Return the weighted map of the edges that may be the tip, or the flag that says why not.
 
@@ -74,11 +75,13 @@ def near_motion(
             NaN: it can be anywhere.
         noise: of the images as they were, grey levels.
         lap: told the name of each step when it ends: ``match``, ``fit``, ``changes``.
+        steady: whether the images are known to be equally bright.
     """
     detector = params.detector
     if len(edges) < detector.min_edges:
         return FEW_EDGES
-    second = second.lit_as(first)
+    if not steady:
+        second = second.lit_as(first)
     sample = _with_room(every_so_many(edges, params.background_edges), first, params)
     matches = match_edges(first.gray, second.gray, sample, detector)
     lap("match")
@@ -123,12 +126,13 @@ def detect_near(
     noise: float,
     params: NearParams,
     lap: Callable[[str], None] = not_asked,
+    steady: bool = False,
 ) -> TipDetection:
     """Select the heaviest of those edges; the first in row-major order of equals.
 
     Args are those of `near_motion`.
     """
-    motion = near_motion(first, second, edges, hand, noise, params, lap)
+    motion = near_motion(first, second, edges, hand, noise, params, lap, steady)
     if isinstance(motion, str):
         return no_detection(motion, len(edges))
     return heaviest(motion, params.detector)

@@ -17,6 +17,7 @@ from tooltip_cli.log.edges import read_edges, write_edges
 from tooltip_cli.log.recording import LoggedImage, Recording
 from tooltip_cli.log.views import Views
 from tooltip_cli.method.types import Array, Indices
+from tooltip_cli.method.voting.lighting import gain
 from tooltip_cli.method.voting.moving import (
     FrameEdges,
     Image,
@@ -207,13 +208,13 @@ class FramesJob:
         jobs: int,
     ) -> None:
         lap = laps()
-        noise = noise_in(recording, noise_frames(pairing, len(views.stamps_ns)))
+        light = light_in(recording, noise_frames(pairing, len(views.stamps_ns)))
         lap("noise")
         scene = Scene(recording, views, pairing.frames, settings.silhouette, jobs)
         lap("background")
         self.on_frame: Callable[[], None] = lambda: None
         self._pairing, self._found = pairing, list[FrameEdges]()
-        self._finder = _Finder(views, scene, noise, settings.moving)
+        self._finder = _Finder(views, scene, light, settings.moving)
 
     @property
     def done(self) -> bool:
@@ -245,7 +246,7 @@ class _Finder:
 
     views: Views
     scene: Scene
-    noise: float
+    light: Light
     params: MovingParams
 
 
@@ -316,16 +317,18 @@ class _SomeFrames:
     def _next(self) -> FrameEdges:
         row = len(self._found)
         look = self._looks[int(self._frames[row])]
+        light = self._finder.light
         before, after = (self._looks[int(index)].smoothed for index in self._partners[row])
         edges = moving_edges(
             look.smoothed,
             (before, after),
             self._centres[row],
             float(self._radii[row]),
-            self._finder.noise,
+            light.noise,
             self._finder.params,
             int(self._levels[row]),
-            look.edges(self._finder.noise),
+            look.edges(light.noise),
+            light.steady,
         )
         return replace(edges, silhouette=self._silhouettes[row])
 
@@ -343,14 +346,23 @@ def noise_frames(pairing: Pairing, count: int) -> Indices:
     return np.stack([firsts[rows], seconds[rows]], axis=1)
 
 
-def noise_in(recording: Recording, pairs: Indices) -> float:
-    """Estimate the sensor noise from (P, 2) pairs of images, grey levels."""
+@dataclass(frozen=True)
+class Light:
+    """What some pairs of images show of sensor and lamps."""
 
-    def estimate() -> float:
+    noise: float  # of the sensor, grey levels
+    steady: bool  # whether all images are equally bright, and need not be made so
+
+
+def light_in(recording: Recording, pairs: Indices) -> Light:
+    """Look at (P, 2) pairs of images for the noise and for light that flickers."""
+
+    def look() -> Light:
         images = list(recording.images(pairs.ravel(), gray=True))
-        return noise_level(list(zip(images[::2], images[1::2], strict=True)))
+        shown = list(zip(images[::2], images[1::2], strict=True))
+        return Light(noise_level(shown), all(gain(*pair) == 1.0 for pair in shown))
 
-    return recording.once((noise_in, pairs.tobytes()), estimate)
+    return recording.once((light_in, pairs.tobytes()), look)
 
 
 def hand_in_image(views: Views, frames: Indices, reach: float) -> tuple[Array, Array]:

@@ -15,7 +15,14 @@ from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.params import VotingSettings
 from tooltip_cli.stages.artifacts import digest, stage_key
 from tooltip_cli.stages.clock import Lap
-from tooltip_cli.stages.moving import Look, hand_in_image, look_at, noise_frames, noise_in
+from tooltip_cli.stages.moving import (
+    Light,
+    Look,
+    hand_in_image,
+    light_in,
+    look_at,
+    noise_frames,
+)
 from tooltip_cli.stages.voting import pair_views
 
 VERSION = 2
@@ -34,13 +41,13 @@ class NearHand:
     noise_frames: Indices  # (P, 2) pairs of images that show the noise
 
     @property
-    def noise(self) -> float:
-        """Of the recording's images, grey levels.
+    def light(self) -> Light:
+        """What the recording's images show of sensor and lamps.
 
         Raises:
             TooltipError: an image cannot be decoded.
         """
-        return noise_in(self.recording, self.noise_frames)
+        return light_in(self.recording, self.noise_frames)
 
     @property
     def key(self) -> str:
@@ -59,8 +66,8 @@ class NearHand:
         shown = [
             Shown(image, look.smoothed) for image, look in zip((first, second), looks, strict=True)
         ]
-        edges = looks[0].edges(self.noise)
-        return near_motion(shown[0], shown[1], edges, self.hands[frame], self.noise, self.params)
+        noise, hand = self.light.noise, self.hands[frame]
+        return near_motion(shown[0], shown[1], looks[0].edges(noise), hand, noise, self.params)
 
     def parts(self) -> Callable[[range], _SomePairs]:
         """Return what finds the tip in the pairs of some consecutive images.
@@ -68,16 +75,16 @@ class NearHand:
         Raises:
             TooltipError: an image that shows the noise cannot be decoded.
         """
-        noise = self.noise  # before threads ask for it
-        return lambda images: _SomePairs(self, noise, images)
+        light = self.light  # before threads ask for it
+        return lambda images: _SomePairs(self, light, images)
 
 
 class _SomePairs:
     """The pairs of some consecutive images."""
 
-    def __init__(self, near: NearHand, noise: float, images: range) -> None:
+    def __init__(self, near: NearHand, light: Light, images: range) -> None:
         self.wanted = frozenset(images) if len(images) > 1 else frozenset()
-        self._near, self._noise = near, noise
+        self._near, self._light = near, light
         self._first: tuple[Shown, Look] | None = None
         self._rows: list[TipDetection] = []
 
@@ -91,11 +98,12 @@ class _SomePairs:
         lap("smooth")
         if self._first is not None:
             first, look_at_first = self._first
-            edges = look_at_first.edges(self._noise)
+            light = self._light
+            edges = look_at_first.edges(light.noise)
             lap("edges")
             hand = near.hands[index - 1]
             self._rows.append(
-                detect_near(first, second, edges, hand, self._noise, near.params, lap)
+                detect_near(first, second, edges, hand, light.noise, near.params, lap, light.steady)
             )
         self._first = second, look
 

@@ -160,6 +160,7 @@ def moving_edges(
     params: MovingParams,
     level: int = 0,
     edges: npt.NDArray[np.int32] | None = None,
+    steady: bool = False,
 ) -> FrameEdges:
     """Find the edges of one image that move against the background to either partner.
 
@@ -171,6 +172,7 @@ def moving_edges(
         level: how often images are halved for the motion to fit the search window; matches that
             are found there are made exact on the whole images.
         edges: (N, 2) u, v, where they are known, see `image_edges`.
+        steady: whether the images are known to be equally bright.
     """
     if edges is None:
         edges = image_edges(image, canny_thresholds(noise, params), params)
@@ -184,7 +186,8 @@ def moving_edges(
         return _nothing(affines)
     differs = np.zeros(image.shape, dtype=bool)
     sample = every_so_many(edges, params.background_edges)
-    others = (evened(others[0], image), evened(others[1], image))
+    if not steady:
+        others = (evened(others[0], image), evened(others[1], image))
     small = halve(image, level)
     pairs = [_Pair(image, other, small, halve(other, level), scale, params) for other in others]
     for side, (other, pair) in enumerate(zip(others, pairs, strict=True)):

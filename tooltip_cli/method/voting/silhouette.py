@@ -31,6 +31,7 @@ _BLUR_PX = 0.8  # standard deviation, of image and backdrop before they are comp
 _BLUR_SIDE = 5  # pixels; further weights are 0, but would be looked at
 _PIXELS_AT_ONCE = 1 << 14  # of all samples, so that they stay close to the processor
 _FEW = 3  # samples that show what blurring takes of the noise
+_THIN = 8  # rows that one is looked at of
 _FAR_OUT = 0.8  # quantile of the differences that shows it
 _NOISE_TAKEN = 0.25  # what blurring takes less of is no noise, but things that are displaced
 _PLATEAU_PX = 7  # side of the square in which the contrast at an outline is looked up
@@ -142,8 +143,8 @@ def _taken(samples: Image, colour: Image, smoothed: Image) -> float:
     few = samples[:: max(len(samples) // _FEW, 1)]
     # far out, as noise that JPEG makes has long tails; hand and tool cover less than the rest
     left = [
-        np.quantile(_largest(cv2.absdiff(_blurred(sample), smoothed)), _FAR_OUT)
-        / max(np.quantile(_largest(cv2.absdiff(sample, colour)), _FAR_OUT), 1.0)
+        np.quantile(_largest(cv2.absdiff(_blurred(sample), smoothed))[::_THIN], _FAR_OUT)
+        / max(np.quantile(_largest(cv2.absdiff(sample, colour))[::_THIN], _FAR_OUT), 1.0)
         for sample in few
     ]
     taken = 1.0 - float(np.median(left))
