@@ -120,11 +120,12 @@ class TipEstimate:
             self,
             covariance=None if self.covariance is None else self.covariance + covariance,
             candidates=tuple(
-                item if item.covariance is None
+                item
+                if item.covariance is None
                 else replace(item, covariance=item.covariance + covariance)
                 for item in self.candidates
             ),
-        )  # fmt: skip
+        )
 
 
 def refused(method: str, frames_used: int, *reasons: Reason) -> TipEstimate:

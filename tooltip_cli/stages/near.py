@@ -66,8 +66,11 @@ class NearHand:
         shown = [
             Shown(image, look.smoothed) for image, look in zip((first, second), looks, strict=True)
         ]
-        noise, hand = self.light.noise, self.hands[frame]
-        return near_motion(shown[0], shown[1], looks[0].edges(noise), hand, noise, self.params)
+        light = self.light
+        edges, hand = looks[0].edges(light.noise), self.hands[frame]
+        return near_motion(
+            shown[0], shown[1], edges, hand, light.noise, self.params, steady=light.steady
+        )
 
     def parts(self) -> Callable[[range], _SomePairs]:
         """Return what finds the tip in the pairs of some consecutive images.

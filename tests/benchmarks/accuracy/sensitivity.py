@@ -1,7 +1,7 @@
 """How flat the parameters of the voting method are: each halved and doubled, the rest as it is.
 
 Example:
-    python tests/benchmarks/accuracy/sensitivity.py DIR/*.mcap --groups voting end refine
+    python -m tests.benchmarks.accuracy.sensitivity DIR/*.mcap --groups voting end refine
 
 Prints, for each parameter, the mean tip error of the nearest candidate over the recordings, and the
 worst, in millimetres; at the start that of the defaults. Recordings need the truth inside or beside
@@ -11,7 +11,6 @@ them, as in run.py. The groups pairing, moving and silhouette detect anew for ea
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from tests.benchmarks.accuracy.run import rig_beside, true_tip
 from tooltip_cli.log.recording import Recording, read_recording
 from tooltip_cli.log.views import Views, resolve_rig, resolve_views
 from tooltip_cli.method.rays import sphere_array
@@ -52,12 +52,12 @@ class Case:
 
     def __init__(self, path: Path) -> None:
         self.recording: Recording = read_recording(path)
-        beside = path.with_suffix(".rig.yaml")
-        rig = resolve_rig(self.recording, beside if beside.exists() else None)
+        rig = resolve_rig(self.recording, rig_beside(path))
         self.views: Views = resolve_views(self.recording, rig)
-        truth = path.with_suffix(".truth.json")
-        text = truth.read_text() if truth.exists() else self.recording.attachments["truth.json"]
-        self.truth = np.array(json.loads(text)["tip_in_hand_m"])
+        truth = true_tip(path, self.recording.attachments)
+        if truth is None:
+            raise ValueError(f"{path}: the true tip is neither inside nor beside it")
+        self.truth = truth
         self._default: MovingEdges | None = None
 
     def error_mm(self, settings: VotingSettings) -> float:

@@ -133,8 +133,7 @@ def _rough_ends(
     rough: list[_Rough] = []
     if silhouettes is not None:
         hull = visual_hull(silhouettes, spheres, edges.reach, settings.hull)
-        sure = _confirmed(hull, shape, settings.hull.confirmed)
-        likely = _confirmed(hull, shape, settings.hull.likely)
+        sure, likely = _confirmed(hull, shape, settings.hull.confirmed, settings.hull.likely)
         beyond = [(hull, hull.voxels[row], 0.0) for row, _ in _both_ways(hull, grip, settings)]
         # as far out, what shows no edges, as a pale cap in noise; nearer it is what is sure
         beyond += [
@@ -180,15 +179,15 @@ def _both_ways(shape: Shape, grip: Array, settings: VotingSettings) -> list[tupl
     return rows
 
 
-def _confirmed(hull: Shape, shape: Shape, within: float) -> Shape:
-    """Return the hull's voxels that have a voted one nearby, metres."""
+def _confirmed(hull: Shape, shape: Shape, *within: float) -> list[Shape]:
+    """Return the hull's voxels that have a voted one nearer than each distance, metres."""
     from scipy.spatial import KDTree
 
     if not len(hull.voxels):
-        return hull
-    distances, _ = KDTree(shape.voxels).query(hull.voxels, distance_upper_bound=within)
-    near = np.isfinite(distances)
-    return Shape(hull.voxels[near], hull.counts[near])
+        return [hull for _ in within]
+    distances, _ = KDTree(shape.voxels).query(hull.voxels, distance_upper_bound=max(within))
+    near = [distances < limit for limit in within]
+    return [Shape(hull.voxels[rows], hull.counts[rows]) for rows in near]
 
 
 @dataclass(frozen=True)

@@ -130,22 +130,27 @@ def learn_backdrop(samples: Image, params: SilhouetteParams) -> Backdrop:
     seen = (off <= limit).view(np.uint8).sum(axis=0, dtype=counter) / len(off)
     unknown = (seen < params.min_seen) | (tolerance > params.most_contrast)
     smoothed = _blurred(colour)
-    tolerance -= params.tolerance * _GAUSSIAN_PER_MAD * noise * _taken(samples, colour, smoothed)
+    tolerance -= params.tolerance * _GAUSSIAN_PER_MAD * noise * _taken(samples, off, smoothed)
     tolerance = np.maximum(tolerance, params.least_contrast)
     tolerance = np.where(unknown, NOTHING_KNOWN, np.ceil(tolerance))
     return Backdrop(smoothed, tolerance.astype(np.uint8))
 
 
-def _taken(samples: Image, colour: Image, smoothed: Image) -> float:
-    """Return the part of the noise that blurring takes, with which images are then compared."""
+def _taken(samples: Image, off: Image, smoothed: Image) -> float:
+    """Return the part of the noise that blurring takes, with which images are then compared.
+
+    Args:
+        off: (S, H, W) how far the samples (S, H, W, C) are from the scene.
+        smoothed: (H, W, C) the scene, blurred.
+    """
     import cv2
 
-    few = samples[:: max(len(samples) // _FEW, 1)]
+    few = slice(None, None, max(len(samples) // _FEW, 1))
     # far out, as noise that JPEG makes has long tails; hand and tool cover less than the rest
     left = [
         np.quantile(_largest(cv2.absdiff(_blurred(sample), smoothed))[::_THIN], _FAR_OUT)
-        / max(np.quantile(_largest(cv2.absdiff(sample, colour))[::_THIN], _FAR_OUT), 1.0)
-        for sample in few
+        / max(np.quantile(raw[::_THIN], _FAR_OUT), 1.0)
+        for sample, raw in zip(samples[few], off[few], strict=True)
     ]
     taken = 1.0 - float(np.median(left))
     return taken if taken > _NOISE_TAKEN else 0.0
