@@ -18,7 +18,9 @@ from tooltip_cli.method.voting.end import (
     far_voxels,
     locate_end,
     locate_hull_end,
+    may_be_meant,
     tool_shape,
+    unit_vector,
 )
 from tooltip_cli.method.voting.params import EndParams
 from tooltip_cli.method.voting.volume import Cloud
@@ -193,7 +195,7 @@ def test_a_nearer_end_is_no_candidate() -> None:
     voxels = np.array([[0.0, 0.0, 0.2], [0.0, 0.17, 0.0], [0.15, 0.0, 0.0], [0.0, 0.02, 0.19]])
     shape = Shape(voxels, np.full(4, 9.0))
     assert far_voxels(shape, PARAMS).tolist() == [0, 1]
-    assert far_voxels(shape, replace(PARAMS, other_end_share=0.7)).tolist() == [0, 1, 2]
+    assert far_voxels(shape, replace(PARAMS, far_share=0.7)).tolist() == [0, 1, 2]
     assert far_voxels(shape, replace(PARAMS, end_separation=0.01)).tolist() == [0, 3, 1]
 
 
@@ -204,7 +206,62 @@ def test_an_end_is_far_from_the_grip() -> None:
     grip = np.array([0.0, -0.027, 0.061])
     assert far_voxels(shape, PARAMS).tolist() == [0]
     assert far_voxels(shape, PARAMS, grip).tolist() == [1]
-    assert far_voxels(shape, replace(PARAMS, other_end_share=0.6), grip).tolist() == [1, 0]
+    assert far_voxels(shape, replace(PARAMS, far_share=0.6), grip).tolist() == [1, 0]
+
+
+def stick(first: float, other: float, widths: tuple[float, float]) -> tuple[Shape, Array, Array]:
+    """Return what shows of a straight tool on both sides of a grip, and its ends, metres.
+
+    Args:
+        first: how far it reaches from the grip, upwards.
+        other: how far downwards.
+        widths: radius of each of these parts.
+    """
+    rng = np.random.default_rng(0)
+    parts = []
+    for length, width in zip((first, -other), widths, strict=True):
+        along = length - np.sign(length) * rng.uniform(0, 0.04, 400)
+        angle, radius = rng.uniform(0, 2 * np.pi, 400), width * np.sqrt(rng.uniform(0, 1, 400))
+        parts.append(np.stack([radius * np.cos(angle), radius * np.sin(angle), along], axis=1))
+    grip = np.array([0.06, 0.0, 0.0])
+    voxels = grip + np.concatenate(parts)
+    tips = grip + np.array([[0.0, 0.0, first], [0.0, 0.0, -other]])
+    return Shape(voxels, np.full(len(voxels), 9.0)), tips, grip
+
+
+def meant(shape: Shape, tips: Array, grip: Array, params: EndParams = PARAMS) -> bool:
+    first, other = [(tip, unit_vector(tip - grip)) for tip in tips]
+    return may_be_meant(shape, first, other, grip, params)
+
+
+def test_an_end_that_is_about_as_far_out_may_be_meant() -> None:
+    assert meant(*stick(0.15, 0.14, (0.005, 0.005)))
+    assert not meant(*stick(0.15, 0.08, (0.005, 0.005)))
+    assert meant(*stick(0.15, 0.08, (0.005, 0.005)), replace(PARAMS, other_end_share=0.2))
+
+
+def test_nearer_to_the_wrist_but_farther_from_the_grip_may_be_meant() -> None:
+    """A tool held tilted towards the wrist, whose handle's end is farther from that."""
+    grip = np.array([0.0, -0.027, 0.061])
+    handle, tip = np.array([-0.036, -0.035, 0.148]), np.array([0.103, -0.019, -0.008])
+    assert np.linalg.norm(tip) < 0.7 * np.linalg.norm(handle)
+    none = Shape(np.zeros((0, 3)), np.zeros(0))
+    assert meant(none, np.stack([handle, tip]), grip)
+    assert not meant(none, np.stack([handle, grip + 0.7 * (tip - grip)]), grip)
+
+
+def test_a_thicker_end_beyond_the_hand_may_be_meant() -> None:
+    """There is no telling a cord with a plug from a handle with a shaft."""
+    assert meant(*stick(0.15, 0.09, (0.004, 0.012)))
+    assert not meant(*stick(0.15, 0.09, (0.012, 0.004)))
+    assert not meant(*stick(0.15, 0.06, (0.004, 0.012)))  # hardly comes out of the hand
+    shape, tips, grip = stick(0.15, 0.09, (0.004, 0.012))
+    sideways = grip + (shape.voxels[400:] - grip)[:, [2, 1, 0]] * np.array([-1, 1, 1])
+    beside = Shape(np.concatenate([shape.voxels[:400], sideways]), shape.counts)
+    butt = grip + np.array([0.09, 0.0, 0.0])
+    assert not meant(beside, np.stack([tips[0], butt]), grip)  # not beyond the hand
+    few = Shape(shape.voxels[:403], shape.counts[:403])
+    assert not meant(few, tips, grip)
 
 
 def test_of_voxels_that_are_equally_far_one_stands_for_the_end() -> None:

@@ -57,7 +57,7 @@ from tooltip_cli.stages.near import near_unless
 from tooltip_cli.stages.voting import vote
 
 SUFFIX = ".tip.json"
-VERSION = 7
+VERSION = 8
 _LOGGER = logging.getLogger(__name__)
 
 

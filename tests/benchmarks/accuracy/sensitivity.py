@@ -32,7 +32,15 @@ from tooltip_cli.stages.voting import hand_edges, pair_views
 
 SKIPPED = {"seed"}
 DETECTED = {"pairing", "moving", "silhouette"}
-SHARES = {"as_good", "other_end_support", "other_end_share", "wanted_support", "wanted_share"}
+SHARES = {
+    "as_good",
+    "other_end_support",
+    "other_end_share",
+    "wanted_support",
+    "wanted_share",
+    "far_share",
+    "opposite_share",
+}
 """Of the most there is: no more than one."""
 
 

@@ -23,6 +23,7 @@ _BIN = 0.001  # metres, of the density along the axis
 _BLURS = (1.5, 2.0, 2.5, 3.0)  # bins, standard deviations tried for how blurred the end is
 _NO_SCORE = np.inf
 _BESIDE = 27  # voxels about one, itself among them
+_OPPOSITE = -0.7  # cosine: within 45 degrees of straight through the hand
 _SOLID_VOXELS = 2000  # of a solid, whose axis is looked for
 _FAR_SIDE_ROUNDS = 3  # of finding its middle and the axis through it
 _LEAST_RADIUS = 0.001  # metres, of an end
@@ -102,7 +103,7 @@ def far_voxels(shape: Shape, params: EndParams, grip: Array | None = None) -> In
 
     distances = np.linalg.norm(shape.voxels - (0.0 if grip is None else grip), axis=1)
     order = np.argsort(-distances, kind="stable")
-    order = order[distances[order] >= params.other_end_share * distances.max()]
+    order = order[distances[order] >= params.far_share * distances.max()]
     # most have a farther one right beside them, which is soon seen
     beside = min(len(shape.voxels), _BESIDE)
     _, neighbours = KDTree(shape.voxels).query(
@@ -117,6 +118,45 @@ def far_voxels(shape: Shape, params: EndParams, grip: Array | None = None) -> In
         if distances[near].max() <= distances[candidate] and not near[ends].any():
             ends.append(int(candidate))
     return np.array(ends, dtype=np.intp)
+
+
+def may_be_meant(
+    shape: Shape,
+    first: tuple[Array, Array],
+    other: tuple[Array, Array],
+    grip: Array,
+    params: EndParams,
+) -> bool:
+    """Return whether another end than the first may be the tool's tip as well.
+
+    It may if it is as far out, by wrist and grip together: a tool that is held tilted towards the
+    wrist has its handle's end farther from that than its tip. So may what is thicker, on the other
+    side of the hand: there is no telling a cord with a plug from a handle with a shaft.
+
+    Args:
+        first: position and axis (3,), metres, hand frame, of the end farthest from the wrist.
+        other: those of another one.
+        grip: (3,) metres, hand frame.
+    """
+    here, there = first[0] - grip, other[0] - grip
+    from_wrist = float(np.linalg.norm(other[0]) / np.linalg.norm(first[0]))
+    from_grip = float(np.linalg.norm(there) / np.linalg.norm(here))
+    if from_wrist * from_grip >= params.other_end_share:
+        return True
+    opposite = float(unit_vector(there) @ unit_vector(here)) < _OPPOSITE
+    if not opposite or from_grip < params.opposite_share:
+        return False
+    thickness = _thickness(shape, *first, params)
+    return 0 < params.thicker * thickness <= _thickness(shape, *other, params)
+
+
+def _thickness(shape: Shape, end: Array, axis: Array, params: EndParams) -> float:
+    """Return how far what is near an end scatters across its axis, metres, root mean square."""
+    near = shape.voxels[np.linalg.norm(shape.voxels - end, axis=1) < params.end_separation]
+    if len(near) < params.min_voxels:
+        return 0.0
+    scatter = np.cov(near.T)
+    return float(np.sqrt(np.trace(scatter) - axis @ scatter @ axis))
 
 
 def locate_end(

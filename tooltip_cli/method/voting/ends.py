@@ -20,7 +20,9 @@ from tooltip_cli.method.voting.end import (
     locate_end,
     locate_far_side,
     locate_hull_end,
+    may_be_meant,
     tool_shape,
+    unit_vector,
 )
 from tooltip_cli.method.voting.hull import visual_hull
 from tooltip_cli.method.voting.outline import fit_outlines
@@ -60,9 +62,8 @@ def find_ends(
 ) -> list[FoundEnd]:
     """Return the tool's ends, the farthest from the wrist first; at least one.
 
-    An end is also what is farthest from the grip: a tool that is held tilted towards the wrist has
-    its handle's end farther from that than its tip. Where a direction says which end is meant, ends
-    that are nearer to both are looked at besides.
+    Others are there if they `may_be_meant`. Where a direction says which end is, ends that are
+    nearer to wrist and grip are looked at besides.
 
     Args:
         shape: where the votes say that hand or tool is; not empty.
@@ -70,9 +71,14 @@ def find_ends(
     """
     end = settings.end
     if settings.prefer is not None:
-        end = replace(end, other_end_support=end.wanted_support, other_end_share=end.wanted_share)
+        end = replace(
+            end,
+            far_share=end.wanted_share,
+            other_end_support=end.wanted_support,
+            other_end_share=end.wanted_share**2,
+        )
     ends = _put_right(edges, cloud, shape, spheres, replace(settings, end=end))
-    return _apart(ends, grip_of(spheres), end)
+    return _apart(ends, shape, grip_of(spheres), end)
 
 
 def _put_right(
@@ -92,7 +98,7 @@ def _put_right(
     return ends
 
 
-def _apart(ends: list[FoundEnd], grip: Array, params: EndParams) -> list[FoundEnd]:
+def _apart(ends: list[FoundEnd], shape: Shape, grip: Array, params: EndParams) -> list[FoundEnd]:
     """Return ends that differ, the farthest first; of those at one place the best.
 
     One that far fewer images show, or agree on, than on another is no end that could be meant.
@@ -111,14 +117,12 @@ def _apart(ends: list[FoundEnd], grip: Array, params: EndParams) -> list[FoundEn
         end for end in kept if end.agreement >= agreement and end.candidate.support >= support
     ] or kept[:1]
     kept.sort(key=lambda end: (end.by_grip, -float(np.linalg.norm(end.candidate.position))))
-    first = kept[0].candidate.position
-    least, from_grip = params.other_end_share * np.linalg.norm(first), np.linalg.norm(first - grip)
-    return [
-        end
-        for end in kept
-        if np.linalg.norm(end.candidate.position) >= least
-        or np.linalg.norm(end.candidate.position - grip) > from_grip
+    lines = [
+        (it.position, unit_vector(it.position - grip) if it.axis is None else it.axis)
+        for it in (end.candidate for end in kept)
     ]
+    meant = [may_be_meant(shape, lines[0], line, grip, params) for line in lines[1:]]
+    return [kept[0], *(end for end, as_well in zip(kept[1:], meant, strict=True) if as_well)]
 
 
 def _rough_ends(
@@ -163,19 +167,21 @@ def _rough_ends(
 
 
 def _both_ways(shape: Shape, grip: Array, settings: VotingSettings) -> list[tuple[int, bool]]:
-    """Return voxels that are far from the wrist, and the one that is farthest from the grip.
-
-    With a preferred direction, all that are far from the grip.
+    """Return voxels that are far from the wrist, and others that may be meant as well.
 
     Returns:
-        rows, and whether each is there for the grip alone.
+        rows, and whether each is far from the grip alone.
     """
-    rows = [(int(row), False) for row in far_voxels(shape, settings.end)]
-    by_grip = far_voxels(shape, settings.end, grip)
-    for row in by_grip if settings.prefer is not None else by_grip[:1]:
-        apart = np.linalg.norm(shape.voxels[[at for at, _ in rows]] - shape.voxels[row], axis=1)
-        if (apart >= settings.outline.same_end).all():
+    end = settings.end
+    rows = [(int(row), False) for row in far_voxels(shape, end)]
+    outwards = [(at, unit_vector(at - grip)) for at in shape.voxels[[row for row, _ in rows]]]
+    either_way = replace(end, far_share=min(end.far_share, end.opposite_share))
+    for row in far_voxels(shape, either_way, grip):
+        line = (shape.voxels[row], unit_vector(shape.voxels[row] - grip))
+        apart = [np.linalg.norm(line[0] - at) >= settings.outline.same_end for at, _ in outwards]
+        if all(apart) and may_be_meant(shape, outwards[0], line, grip, end):
             rows.append((int(row), True))
+            outwards.append(line)
     return rows
 
 

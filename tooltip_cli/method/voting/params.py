@@ -94,10 +94,13 @@ class EndParams:
     min_frames: float = 6.0  # that agree on a voxel, smoothed over neighbours
     min_share: float = 0.12  # of what the tool's clearest voxels have
     min_voxels: int = 8  # smaller pieces are specks
-    other_end_support: float = 0.57  # nor one with less than this share of the most support
-    other_end_share: float = 0.8  # another end nearer to the wrist than this share does not count
-    wanted_support: float = 0.4  # the same two, where a direction says which end is meant
-    wanted_share: float = 0.4
+    far_share: float = 0.8  # of the farthest's distance from wrist or grip, that ends have
+    other_end_support: float = 0.5  # of the most support, without which another end does not count
+    other_end_share: float = 0.65  # of the first's distance from the wrist times that from the grip
+    wanted_support: float = 0.4  # instead, where a direction says which end is meant
+    wanted_share: float = 0.4  # the same, of each of the two distances
+    opposite_share: float = 0.5  # of the first end's distance from the grip, beyond the hand
+    thicker: float = 1.3  # than the first: an end there counts, as what is thin may be a cord
     end_separation: float = 0.05  # an end is the farthest voxel within this distance
     neighbourhood: float = 0.14  # of the far voxel, that its axis is found from
     short_slab: float = 0.03  # the last stretch, that must be slender
