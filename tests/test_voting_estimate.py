@@ -10,8 +10,13 @@ import pytest
 
 from tests.helpers.scenes import FOCAL, poses_of
 from tests.test_voting_outline import seen as silhouettes_of
-from tooltip_cli.method.types import Reason, TipEstimate
-from tooltip_cli.method.voting.estimate import METHOD, check_motion, estimate_by_voting
+from tooltip_cli.method.types import Reason, TipEstimate, refused
+from tooltip_cli.method.voting.estimate import (
+    METHOD,
+    check_motion,
+    estimate_by_voting,
+    less_sure,
+)
 from tooltip_cli.method.voting.moving import MovingEdges
 from tooltip_cli.method.voting.pairing import pair_frames
 from tooltip_cli.method.voting.params import PairingParams, VotingParams, VotingSettings
@@ -169,6 +174,24 @@ def test_the_same_again(found: TipEstimate) -> None:
     again = estimate_by_voting(view(TIP), SPHERES, SETTINGS)
     np.testing.assert_array_equal(again.position, found.position)
     np.testing.assert_array_equal(again.covariance, found.covariance)
+
+
+def test_what_is_unknown_of_the_rig_is_stated_and_said(found: TipEstimate) -> None:
+    little, much = 0.001**2 * np.eye(3), np.diag([0.0, 0.0, 0.02**2])
+    trust = SETTINGS.trust
+    again = less_sure(found, little, trust)
+    assert found.covariance is not None
+    for covariance in (again.covariance, again.candidates[0].covariance):
+        np.testing.assert_allclose(np.asarray(covariance, float), found.covariance + little)
+    assert again.reasons == found.reasons == ()
+    (reason,) = less_sure(found, much, trust).reasons
+    assert reason.code == "uncertain_end"
+    assert "20 mm" in reason.text
+    assert "clocks and camera" in reason.text
+    twice = less_sure(less_sure(found, much, trust), much, trust)
+    assert [reason.code for reason in twice.reasons] == ["uncertain_end"]
+    nowhere = refused("voting", 3, Reason("no_motion", "still"))
+    assert less_sure(nowhere, much, trust) == nowhere
 
 
 def test_two_ends_are_told_and_the_farther_is_given() -> None:

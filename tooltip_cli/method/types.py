@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -113,19 +113,6 @@ class TipEstimate:
     def status(self) -> str:
         """``ok`` or ``refused``."""
         return "refused" if self.position is None else "ok"
-
-    def less_sure(self, covariance: Array) -> TipEstimate:
-        """Return the same with a covariance (3, 3), m^2, added to all that are known."""
-        return replace(
-            self,
-            covariance=None if self.covariance is None else self.covariance + covariance,
-            candidates=tuple(
-                item
-                if item.covariance is None
-                else replace(item, covariance=item.covariance + covariance)
-                for item in self.candidates
-            ),
-        )
 
 
 def refused(method: str, frames_used: int, *reasons: Reason) -> TipEstimate:

@@ -28,6 +28,7 @@ from tooltip_cli.method.types import (
     TipPixels,
     refused,
 )
+from tooltip_cli.method.voting.estimate import less_sure
 from tooltip_cli.method.voting.pairing import Pairing
 from tooltip_cli.method.voting.volume import HandEdges
 from tooltip_cli.rig.kinematics import inverse_transform
@@ -214,7 +215,8 @@ def estimate_from_images(
         if not refinements:
             return result
         (tip_covariance,) = refinements[0].tip_covariances
-        return replace(result.less_sure(tip_covariance), refinement=refinements[0])
+        result = less_sure(result, tip_covariance, params.voting.trust)
+        return replace(result, refinement=refinements[0])
 
     found = _estimate(recording, views, compute, parents, params, out, force)
     return Estimated(*found, used[0] if used else None)

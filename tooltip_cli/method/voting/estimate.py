@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,14 @@ if TYPE_CHECKING:
     from tooltip_cli.method.voting.volume import Cloud, HandEdges
 
 METHOD = "voting"
+_OF_END = (
+    "as it is round or wide or the images show little of it; turn it so that the camera sees it "
+    "from more sides"
+)
+_OF_RIG = (
+    "as this recording says too little of clocks and camera; put them right with several, by "
+    "tooltip calibrate"
+)
 _FRAMES_FOR_SPREAD = 10  # fewer cannot show that the camera keeps to one side of the hand
 
 
@@ -91,10 +100,34 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     reasons = () if len(candidates) == 1 else (_ambiguous(candidates),)
     if agreement < trust.doubtful_agreement:
         reasons = (*reasons, _disagreeing(agreement))
-    if first.covariance is not None:
-        std = float(np.linalg.eigvalsh(first.covariance)[-1] ** 0.5)
-        reasons = (*reasons, _uncertain(std)) if std > trust.doubtful_std else reasons
+    std = _largest_std(first.covariance)
+    reasons = (*reasons, _uncertain(std, _OF_END)) if std > trust.doubtful_std else reasons
     return TipEstimate(METHOD, first.position, first.covariance, tuple(candidates), reasons, used)
+
+
+def less_sure(estimate: TipEstimate, covariance: Array, trust: TrustParams) -> TipEstimate:
+    """Return an estimate with what is unknown of clocks and camera added to all that it states.
+
+    Args:
+        covariance: (3, 3) m^2, hand frame, of the tip.
+    """
+    candidates = tuple(
+        item if item.covariance is None else replace(item, covariance=item.covariance + covariance)
+        for item in estimate.candidates
+    )
+    if estimate.covariance is None:
+        return replace(estimate, candidates=candidates)
+    said = _largest_std(estimate.covariance) > trust.doubtful_std
+    covariance = estimate.covariance + covariance
+    std, reasons = _largest_std(covariance), estimate.reasons
+    if std > trust.doubtful_std and not said:
+        reasons = (*reasons, _uncertain(std, _OF_RIG))
+    return replace(estimate, covariance=covariance, candidates=candidates, reasons=reasons)
+
+
+def _largest_std(covariance: Array | None) -> float:
+    """Return the standard deviation, metres, in the direction where it is largest; 0: unknown."""
+    return 0.0 if covariance is None else float(np.linalg.eigvalsh(covariance)[-1] ** 0.5)
 
 
 def preferred(candidates: list[Candidate], direction: Array) -> Candidate:
@@ -163,12 +196,9 @@ def _disagreeing(agreement: float) -> Reason:
     )
 
 
-def _uncertain(std: float) -> Reason:
-    return Reason(
-        "uncertain_end",
-        f"the end may lie {1000 * std:.0f} mm away (one standard deviation), as it is round or "
-        "wide or the images show little of it; turn it so that the camera sees it from more sides",
-    )
+def _uncertain(std: float, why: str) -> Reason:
+    away = f"the end may lie {1000 * std:.0f} mm away (one standard deviation), "
+    return Reason("uncertain_end", away + why)
 
 
 def _ambiguous(candidates: list[Candidate]) -> Reason:
