@@ -21,6 +21,7 @@ from tooltip_cli.method.types import (
     Rays,
     Reason,
     TipEstimate,
+    largest_std,
     refused,
 )
 from tooltip_cli.method.voting.params import VotingSettings
@@ -302,7 +303,7 @@ def _checked(
                 "another axis too",
             ),
         )
-    deviation = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    deviation = largest_std(covariance)
     if deviation > params.max_deviation:
         return refused(
             method,

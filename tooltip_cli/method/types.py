@@ -118,3 +118,12 @@ class TipEstimate:
 def refused(method: str, frames_used: int, *reasons: Reason) -> TipEstimate:
     """Return an estimate that states no position."""
     return TipEstimate(method, None, None, (), tuple(reasons), frames_used)
+
+
+def largest_std(covariance: Array) -> float:
+    """Return the standard deviation, metres, in the direction where it is largest.
+
+    Args:
+        covariance: (3, 3) m^2.
+    """
+    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))

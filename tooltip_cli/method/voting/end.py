@@ -120,10 +120,14 @@ def far_voxels(shape: Shape, params: EndParams, grip: Array | None = None) -> In
     return np.array(ends, dtype=np.intp)
 
 
+Place = tuple[Array, Array | None]
+"""Position, metres, and axis of an end, (3,), hand frame; None: straight out from the grip."""
+
+
 def may_be_meant(
     shape: Shape,
-    first: tuple[Array, Array],
-    other: tuple[Array, Array],
+    first: Place,
+    other: Place,
     grip: Array,
     params: EndParams,
 ) -> bool:
@@ -134,8 +138,8 @@ def may_be_meant(
     side of the hand: there is no telling a cord with a plug from a handle with a shaft.
 
     Args:
-        first: position and axis (3,), metres, hand frame, of the end farthest from the wrist.
-        other: those of another one.
+        first: the end farthest from the wrist.
+        other: another one.
         grip: (3,) metres, hand frame.
     """
     here, there = first[0] - grip, other[0] - grip
@@ -146,8 +150,11 @@ def may_be_meant(
     opposite = float(unit_vector(there) @ unit_vector(here)) < _OPPOSITE
     if not opposite or from_grip < params.opposite_share:
         return False
-    thickness = _thickness(shape, *first, params)
-    return 0 < params.thicker * thickness <= _thickness(shape, *other, params)
+    thickness, thickness_there = (
+        _thickness(shape, end, unit_vector(end - grip) if axis is None else axis, params)
+        for end, axis in (first, other)
+    )
+    return 0 < params.thicker * thickness <= thickness_there
 
 
 def _thickness(shape: Shape, end: Array, axis: Array, params: EndParams) -> float:

@@ -22,7 +22,6 @@ from tooltip_cli.method.voting.end import (
     locate_hull_end,
     may_be_meant,
     tool_shape,
-    unit_vector,
 )
 from tooltip_cli.method.voting.hull import visual_hull
 from tooltip_cli.method.voting.outline import fit_outlines
@@ -117,12 +116,18 @@ def _apart(ends: list[FoundEnd], shape: Shape, grip: Array, params: EndParams) -
         end for end in kept if end.agreement >= agreement and end.candidate.support >= support
     ] or kept[:1]
     kept.sort(key=lambda end: (end.by_grip, -float(np.linalg.norm(end.candidate.position))))
-    lines = [
-        (it.position, unit_vector(it.position - grip) if it.axis is None else it.axis)
-        for it in (end.candidate for end in kept)
+    first, *others = kept
+    place = (first.candidate.position, first.candidate.axis)
+    return [
+        first,
+        *(
+            end
+            for end in others
+            if may_be_meant(
+                shape, place, (end.candidate.position, end.candidate.axis), grip, params
+            )
+        ),
     ]
-    meant = [may_be_meant(shape, lines[0], line, grip, params) for line in lines[1:]]
-    return [kept[0], *(end for end, as_well in zip(kept[1:], meant, strict=True) if as_well)]
 
 
 def _rough_ends(
@@ -174,14 +179,13 @@ def _both_ways(shape: Shape, grip: Array, settings: VotingSettings) -> list[tupl
     """
     end = settings.end
     rows = [(int(row), False) for row in far_voxels(shape, end)]
-    outwards = [(at, unit_vector(at - grip)) for at in shape.voxels[[row for row, _ in rows]]]
     either_way = replace(end, far_share=min(end.far_share, end.opposite_share))
     for row in far_voxels(shape, either_way, grip):
-        line = (shape.voxels[row], unit_vector(shape.voxels[row] - grip))
-        apart = [np.linalg.norm(line[0] - at) >= settings.outline.same_end for at, _ in outwards]
-        if all(apart) and may_be_meant(shape, outwards[0], line, grip, end):
+        places = shape.voxels[[at for at, _ in rows]]
+        apart = np.linalg.norm(places - shape.voxels[row], axis=1) >= settings.outline.same_end
+        first, other = (places[0], None), (shape.voxels[row], None)
+        if apart.all() and may_be_meant(shape, first, other, grip, end):
             rows.append((int(row), True))
-            outwards.append(line)
     return rows
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tooltip_cli.method.rays import angular_spread
-from tooltip_cli.method.types import Array, Candidate, Reason, TipEstimate, refused
+from tooltip_cli.method.types import Array, Candidate, Reason, TipEstimate, largest_std, refused
 from tooltip_cli.method.voting.pairing import Pairing, displacement, probe_pixels
 from tooltip_cli.method.voting.params import PairingParams, TrustParams, VotingSettings
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from tooltip_cli.method.voting.volume import Cloud, HandEdges
 
 METHOD = "voting"
+_UNCERTAIN = "uncertain_end"
 _OF_END = (
     "as it is round or wide or the images show little of it; turn it so that the camera sees it "
     "from more sides"
@@ -100,8 +101,7 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     reasons = () if len(candidates) == 1 else (_ambiguous(candidates),)
     if agreement < trust.doubtful_agreement:
         reasons = (*reasons, _disagreeing(agreement))
-    std = _largest_std(first.covariance)
-    reasons = (*reasons, _uncertain(std, _OF_END)) if std > trust.doubtful_std else reasons
+    reasons = (*reasons, *_uncertain(first.covariance, trust, _OF_END))
     return TipEstimate(METHOD, first.position, first.covariance, tuple(candidates), reasons, used)
 
 
@@ -117,17 +117,10 @@ def less_sure(estimate: TipEstimate, covariance: Array, trust: TrustParams) -> T
     )
     if estimate.covariance is None:
         return replace(estimate, candidates=candidates)
-    said = _largest_std(estimate.covariance) > trust.doubtful_std
-    covariance = estimate.covariance + covariance
-    std, reasons = _largest_std(covariance), estimate.reasons
-    if std > trust.doubtful_std and not said:
-        reasons = (*reasons, _uncertain(std, _OF_RIG))
+    covariance, reasons = estimate.covariance + covariance, estimate.reasons
+    if not any(reason.code == _UNCERTAIN for reason in reasons):
+        reasons = (*reasons, *_uncertain(covariance, trust, _OF_RIG))
     return replace(estimate, covariance=covariance, candidates=candidates, reasons=reasons)
-
-
-def _largest_std(covariance: Array | None) -> float:
-    """Return the standard deviation, metres, in the direction where it is largest; 0: unknown."""
-    return 0.0 if covariance is None else float(np.linalg.eigvalsh(covariance)[-1] ** 0.5)
 
 
 def preferred(candidates: list[Candidate], direction: Array) -> Candidate:
@@ -196,9 +189,12 @@ def _disagreeing(agreement: float) -> Reason:
     )
 
 
-def _uncertain(std: float, why: str) -> Reason:
+def _uncertain(covariance: Array | None, trust: TrustParams, why: str) -> tuple[Reason, ...]:
+    std = 0.0 if covariance is None else largest_std(covariance)
+    if std <= trust.doubtful_std:
+        return ()
     away = f"the end may lie {1000 * std:.0f} mm away (one standard deviation), "
-    return Reason("uncertain_end", away + why)
+    return (Reason(_UNCERTAIN, away + why),)
 
 
 def _ambiguous(candidates: list[Candidate]) -> Reason:
