@@ -24,10 +24,12 @@ from tooltip_cli.method.rays import sphere_array
 from tooltip_cli.method.voting.estimate import estimate_by_voting
 from tooltip_cli.method.voting.moving import MovingEdges
 from tooltip_cli.method.voting.params import TrustParams, VotingSettings
+from tooltip_cli.report.scoring import project_tip
 from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.rig.rigfile import load_rig
 from tooltip_cli.stages.calibrate import write_rig
 from tooltip_cli.stages.held_out import unlabelled
+from tooltip_cli.stages.label import find_hints
 from tooltip_cli.stages.moving import DetectedEdges, known_edges
 from tooltip_cli.stages.voting import hand_edges, pair_views
 
@@ -281,6 +283,78 @@ def test_a_wrong_clock_is_put_right(run: Run, tmp_path: Path) -> None:
     again = tooltip("estimate", run.recording, "--rig", late, "--refine", "time", "--json")
     assert "reused" in again.err
     assert json.loads(again.out)["refined"] == refined
+
+
+def test_a_wrong_clock_is_put_right_unasked_where_the_images_disagree(
+    run: Run, tmp_path: Path
+) -> None:
+    assert "refined" not in run.document  # the right one: nothing to look for
+    late = late_rig(run, tmp_path / "late")
+    done = tooltip("estimate", run.recording, "--rig", late, "--json")
+    assert done.code == 0, done.err
+    assert "image clock -" in done.err
+    document = json.loads(done.out)
+    assert document["refined"]["applied"]
+    assert document["refined"]["support_after"] > document["refined"]["support_before"]
+    kept = tooltip("estimate", run.recording, "--rig", late, "--refine", "none", "--json")
+    assert "computed" in kept.err
+    assert "image clock" not in kept.err
+    as_it_is = json.loads(kept.out)
+    assert "refined" not in as_it_is
+    tip = np.array(truth(run.recording)["tip_in_hand_m"])
+    off, off_as_it_is = (
+        np.linalg.norm(np.array(one["tip"]["position_m"]) - tip) for one in (document, as_it_is)
+    )
+    assert off < 0.003
+    assert off_as_it_is > 2 * off
+
+
+def test_all_that_follows_is_by_the_clock_that_was_put_right(run: Run, tmp_path: Path) -> None:
+    late, report = late_rig(run, tmp_path / "late"), tmp_path / "report"
+    done = tooltip("evaluate", run.recording, "--rig", late, "--out", report, "--json")
+    assert done.code == 0, done.err
+    (row,) = json.loads(done.out)["recordings"]
+    kept = tooltip(
+        "evaluate", run.recording, "--rig", late, "--refine", "none",
+        "--out", tmp_path / "kept", "--json",
+    )  # fmt: skip
+    (as_it_is,) = json.loads(kept.out)["recordings"]
+    # labels know nothing of it
+    assert row["baseline"]["error_px"] == as_it_is["baseline"]["error_px"]
+    assert row["detector"]["error_px"]["mean"] < 0.7 * as_it_is["detector"]["error_px"]["mean"]
+    assert row["detector"]["error_px"]["mean"] < row["baseline"]["error_px"]["mean"]
+    assert any("image clock" in note for note in row["notes"])
+    assert not any("image clock" in note for note in as_it_is["notes"])
+
+    estimated = tooltip("estimate", run.recording, "--rig", late, "--json")
+    offset_s = json.loads(estimated.out)["refined"]["time_offset_s"]
+    log = tmp_path / "right.mcap"
+    done = tooltip("export", run.recording, log, "--rig", late)
+    assert done.code == 0, done.err
+    right = resolve_rig(read_recording(log, Topics()), None)
+    assert right.time_offset_s == pytest.approx(0.03 + offset_s, abs=1e-9)
+    hints = find_hints(read_recording(run.recording, Topics()), late, None).predictions
+    recording = read_recording(run.recording, Topics())
+    tip = np.array(json.loads(estimated.out)["tip"]["position_m"])
+    (frame, *_) = hints
+    seen = project_tip(resolve_views(recording, right), tip, np.array([frame]))
+    np.testing.assert_allclose(hints[frame], seen[0], atol=0.01)
+    unshifted = project_tip(
+        resolve_views(recording, load_rig(late)), tip, np.array(list(hints), dtype=np.intp)
+    )
+    assert np.nanmax(np.abs(unshifted - np.array(list(hints.values())))) > 1
+
+
+def test_what_is_exported_is_the_estimate_that_was_asked_for(run: Run) -> None:
+    options = ("--refine", "none", "--prefer", "-1,0,0")
+    done = tooltip("estimate", run.recording, *options)
+    assert done.code == 0, done.err
+    exported = tooltip("export", run.recording, "--tf", *options, "--json")
+    assert exported.code == 0, exported.err
+    assert f"reused {run.tip_path}" in exported.err
+    translation = json.loads(exported.out)["transform"]["transform"]["translation"]
+    tip = run.document["tip"]["position_m"]
+    np.testing.assert_allclose([translation[axis] for axis in "xyz"], tip, atol=1e-6)
 
 
 def test_what_is_unknown_of_the_camera_widens_the_tips_region(run: Run, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.helpers.scenes import FOCAL, poses_of
 from tests.test_voting_refine import AXIS, FRAMES, TIP, seen
-from tooltip_cli.method.types import Correction
+from tooltip_cli.method.types import Correction, Refinement
 from tooltip_cli.method.voting.calibrate import Seen, calibrate
 from tooltip_cli.method.voting.params import CalibrationParams, RefineParams
 from tooltip_cli.method.voting.sight import near_edges
@@ -106,6 +106,36 @@ def test_what_stays_unknown_of_the_rig_is_said_of_the_tip(camera: bool, off: boo
         largest = float(np.linalg.eigvalsh(covariance)[-1] ** 0.5)
         # a camera that is a little farther off looks like a tool that is a little longer
         assert (1e-4 < largest < 1e-3) if camera else (largest < 5e-5)
+
+
+@pytest.mark.parametrize(
+    ("supports", "tried", "best"),
+    [
+        ([(0.3, 0.8)], 1, 0.8),
+        ([(0.6, 0.59)], 1, 0.59),  # nothing to put right
+        ([(0.3, 0.1), (0.2, 0.6)], 2, 0.6),
+        ([(0.3, 0.2), (0.2, 0.1)], 2, 0.2),
+        ([None, (0.2, 0.6)], 2, 0.6),
+    ],
+)
+def test_what_is_no_solution_is_looked_for_with_wider_ends(
+    supports: list[tuple[float, float] | None],
+    tried: int,
+    best: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    radii: list[float] = []
+
+    def solved(recordings: list[Seen], *_: object) -> Refinement | None:
+        radii.append(recordings[0].radius)
+        support = supports[len(radii) - 1]
+        return support and Refinement(Correction(), np.ones(1), True, *support)
+
+    monkeypatch.setattr("tooltip_cli.method.voting.calibrate._calibrated", solved)
+    found = calibrate([recording(0.0, Correction(), 3)], False, PARAMS, REFINE)
+    assert found is not None
+    assert found.support_after == best
+    assert radii == [0.006, 0.012][:tried]
 
 
 def test_no_end_is_no_calibration() -> None:

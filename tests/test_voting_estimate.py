@@ -15,6 +15,7 @@ from tooltip_cli.method.voting.estimate import (
     METHOD,
     check_motion,
     estimate_by_voting,
+    estimate_or_doubt,
     less_sure,
 )
 from tooltip_cli.method.voting.moving import MovingEdges
@@ -308,7 +309,22 @@ def test_it_is_said_when_the_images_agree_little() -> None:
     found = estimate_by_voting(view(TIP), SPHERES, demanding)
     assert found.status == "ok"
     assert [reason.code for reason in found.reasons] == ["images_disagree"]
-    assert "--refine all" in found.reasons[0].text
+    assert "tooltip calibrate" in found.reasons[0].text
+
+
+def test_an_end_is_in_doubt_where_the_images_disagree() -> None:
+    assert estimate_or_doubt(view(TIP), SPHERES, SETTINGS)[1] is None
+    demanding = replace(SETTINGS, trust=replace(SETTINGS.trust, full_agreement=1.01))
+    found, part = estimate_or_doubt(view(TIP), SPHERES, demanding)
+    assert part is not None
+    assert found.position is not None
+    np.testing.assert_array_equal(part.position, found.position)
+    np.testing.assert_array_equal(part.axis, found.candidates[0].axis)
+    assert part.radius > 0
+    only_hand = np.array([[0.0, 0.0, 0.0, 0.2]])
+    refusal, part = estimate_or_doubt(view(TIP / 4), only_hand, demanding)
+    assert refusal.position is None
+    assert part is None
 
 
 def test_it_is_said_when_the_end_is_uncertain() -> None:

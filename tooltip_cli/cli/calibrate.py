@@ -14,7 +14,6 @@ from tooltip_cli.cli.options import (
     print_json,
     progress,
     recordings_argument,
-    refinement_sentence,
     rig_option,
     say,
     topic_options,
@@ -67,7 +66,7 @@ def calibrate(
     """
     from tooltip_cli.log.recording import Topics
     from tooltip_cli.stages.calibrate import calibrate as run
-    from tooltip_cli.stages.calibrate import free_for_rig, write_rig
+    from tooltip_cli.stages.calibrate import free_for_rig, refinement_sentence, write_rig
 
     if out is not None:
         free_for_rig(out, force)

@@ -11,7 +11,9 @@ from tooltip_cli.cli.options import (
     METHODS,
     PATH,
     PRESET_OF_DETECTIONS,
+    Prefer,
     check_names,
+    estimator_params,
     force_option,
     jobs_option,
     json_option,
@@ -22,7 +24,7 @@ from tooltip_cli.cli.options import (
     profile_option,
     progress,
     recordings_argument,
-    refinement_sentence,
+    refine_option,
     rig_option,
     say,
     say_profile,
@@ -48,12 +50,7 @@ from tooltip_cli.cli.options import (
     metavar="CSV",
     help="Estimate from these hand labels instead of detections (the paper's baseline).",
 )
-@click.option(
-    "--refine",
-    type=click.Choice(("time", "all")),
-    help="Find the offset of the image clock (time), and where the camera really is (all), from "
-    "the same images, and use what clearly helps. 'tooltip calibrate' writes it as a rig file.",
-)
+@refine_option
 @preset_option(PRESET_OF_DETECTIONS)
 @prefer_option
 @jobs_option
@@ -69,9 +66,9 @@ def estimate(
     rig: Path | None,
     method: str,
     preset: str,
-    prefer: tuple[float, float, float] | None,
+    prefer: Prefer | None,
     from_labels: Path | None,
-    refine: str | None,
+    refine: str,
     jobs: int,
     profile: bool,
     out: Path | None,
@@ -95,13 +92,11 @@ def estimate(
       tooltip estimate pliers.mcap --from-labels pliers.labels.csv
     """
     from tooltip_cli.log.recording import Topics
-    from tooltip_cli.method.estimators import EstimatorParams
-    from tooltip_cli.method.voting.params import VotingSettings
+    from tooltip_cli.stages.calibrate import refinement_sentence
     from tooltip_cli.stages.clock import measuring
     from tooltip_cli.stages.estimate import estimate as run
 
-    if refine is not None and (method != "voting" or from_labels is not None):
-        raise click.UsageError("--refine works from images with --method voting alone")
+    params = estimator_params(method, prefer, refine, from_labels)
     documents: list[dict[str, Any]] = []
     refusals = 0
     check_names(recordings, out)
@@ -114,10 +109,9 @@ def estimate(
                 path,
                 rig=rig,
                 topics=Topics(image=image, joints=joints, info=info, pose=pose),
-                params=EstimatorParams(method=method, voting=VotingSettings(prefer=prefer)),
+                params=params,
                 preset=preset,
                 from_labels=from_labels,
-                refine=refine,
                 out=out,
                 force=force,
                 jobs=jobs,

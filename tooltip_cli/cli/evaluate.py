@@ -12,6 +12,8 @@ from tooltip_cli.cli.options import (
     METHODS,
     PATH,
     PRESET_OF_DETECTIONS,
+    Prefer,
+    estimator_params,
     force_option,
     jobs_option,
     json_option,
@@ -20,6 +22,7 @@ from tooltip_cli.cli.options import (
     print_json,
     printable,
     progress,
+    refine_option,
     say,
     table,
     topic_options,
@@ -63,6 +66,7 @@ EXIT_CODES = {"ok": 0, "refused": 3, "failed": 1}
 )
 @preset_option(PRESET_OF_DETECTIONS)
 @prefer_option
+@refine_option
 @click.option(
     "--train", type=click.IntRange(min=1), default=400, show_default=True, help="Training frames."
 )
@@ -113,7 +117,8 @@ def evaluate(
     rig: Path | None,
     method: str,
     preset: str,
-    prefer: tuple[float, float, float] | None,
+    prefer: Prefer | None,
+    refine: str,
     train: int,
     test: int,
     seed: int,
@@ -172,8 +177,6 @@ def evaluate(
         )
         return
     from tooltip_cli.log.recording import Topics
-    from tooltip_cli.method.estimators import EstimatorParams
-    from tooltip_cli.method.voting.params import VotingSettings
     from tooltip_cli.stages.artifacts import plain
     from tooltip_cli.stages.evaluate import evaluate as run
 
@@ -188,7 +191,7 @@ def evaluate(
             test=test,
             seed=seed,
             split=split,
-            params=EstimatorParams(method=method, voting=VotingSettings(prefer=prefer)),
+            params=estimator_params(method, prefer, refine),
             preset=preset,
             curve=curve,
             frame=frame,

@@ -11,11 +11,15 @@ from tooltip_cli.cli.options import (
     METHODS,
     PATH,
     PRESET_OF_DETECTIONS,
+    Prefer,
+    estimator_params,
     jobs_option,
     json_option,
+    prefer_option,
     preset_option,
     print_json,
     progress,
+    refine_option,
     rig_option,
     say,
     topic_options,
@@ -45,6 +49,8 @@ if TYPE_CHECKING:
     help="Of the estimate.",
 )
 @preset_option(PRESET_OF_DETECTIONS)
+@prefer_option
+@refine_option
 @click.option("--out", type=PATH, help="Directory of the results. Default: beside the recording.")
 @jobs_option
 @topic_options
@@ -59,6 +65,8 @@ def export(
     rig: Path | None,
     method: str,
     preset: str,
+    prefer: Prefer | None,
+    refine: str,
     out: Path | None,
     jobs: int,
     image: str | None,
@@ -76,7 +84,8 @@ def export(
     standard deviations. --urdf writes the robot with the link 'tool_tip' on a fixed joint of the
     hand. --tf prints a static_transform_publisher command, and a geometry_msgs/TransformStamped
     as YAML. --cloud writes what was seen of hand and tool, coarse but enough to see why the tip is
-    where it is. Detections and estimate are made first where they are missing or out of date.
+    where it is. Detections and estimate are made first where they are missing or out of date, or
+    were made with other options than these.
 
     Exits with 3 where --urdf or --tf has no estimate to take: it was refused.
 
@@ -88,7 +97,6 @@ def export(
       tooltip export pliers.mcap --cloud pliers.ply
     """
     from tooltip_cli.log.recording import Topics
-    from tooltip_cli.method.estimators import EstimatorParams
     from tooltip_cli.stages.export import (
         export_cloud,
         export_urdf,
@@ -106,7 +114,7 @@ def export(
             recording,
             rig=rig,
             topics=Topics(image=image, joints=joints, info=info, pose=pose),
-            params=EstimatorParams(method=method),
+            params=estimator_params(method, prefer, refine),
             preset=preset,
             out=out,
             jobs=jobs,

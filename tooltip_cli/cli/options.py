@@ -20,12 +20,14 @@ import click
 from tooltip_cli.errors import TooltipError
 
 if TYPE_CHECKING:
+    from tooltip_cli.method.estimators import EstimatorParams
     from tooltip_cli.stages.clock import Stopwatch
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 PATH = click.Path(path_type=Path)
 METHODS = ("voting", "kmeans", "map")
+Prefer = tuple[float, float, float]
 _PATIENCE_S = 1.0
 _RESULTS = (".detections.mcap", ".edges.mcap")
 
@@ -287,7 +289,7 @@ class Direction(click.ParamType):  # type: ignore[type-arg]  # generic in newer 
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, float, float]:
+    ) -> Prefer:
         """Return the three numbers."""
         try:
             x, y, z = (float(part) for part in value.split(","))
@@ -307,22 +309,31 @@ prefer_option = click.option(
 )
 
 
-def refinement_sentence(refined: dict[str, Any]) -> str:
-    """Say in words what was found out about clocks and camera."""
-    text = (
-        f"image clock {1000 * refined['time_offset_s']:+.1f} +-"
-        f"{1000 * refined['time_offset_std_s']:.1f} ms"
-    )
-    camera = refined["camera"]
-    if camera is not None:
-        turn = sum(value**2 for value in camera["rotation_deg"]) ** 0.5
-        step = 1000 * sum(value**2 for value in camera["translation_m"]) ** 0.5
-        text += f", camera turned by {turn:.2f} degrees and moved by {step:.1f} mm"
-    shares = (
-        f"{refined['support_before']:.0%} of what the images could show of the tool's end fits "
-        f"without and {refined['support_after']:.0%} with it"
-    )
-    return f"{text}: {'used' if refined['applied'] else 'not used'}; {shares}"
+refine_option = click.option(
+    "--refine",
+    type=click.Choice(("auto", "none", "time", "all")),
+    default="auto",
+    show_default=True,
+    help="Find the offset of the image clock (time), and where the camera really is (all), from "
+    "the same images, and use what clearly helps; auto: all, where the images disagree about the "
+    "end. 'tooltip calibrate' writes it as a rig file. For --method voting.",
+)
+
+
+def estimator_params(
+    method: str, prefer: Prefer | None, refine: str, from_labels: Path | None = None
+) -> EstimatorParams:
+    """Return the parameters that --method, --prefer and --refine choose.
+
+    Raises:
+        click.UsageError: --refine where it has no use.
+    """
+    from tooltip_cli.method.estimators import EstimatorParams
+    from tooltip_cli.method.voting.params import VotingSettings
+
+    if refine in ("time", "all") and (method != "voting" or from_labels is not None):
+        raise click.UsageError("--refine works from images with --method voting alone")
+    return EstimatorParams(method=method, voting=VotingSettings(prefer=prefer, put_right=refine))
 
 
 def tip_sentence(name: str, document: dict[str, Any]) -> str:

@@ -11,6 +11,7 @@ import click
 
 from tooltip_cli.cli.options import (
     PATH,
+    Prefer,
     StatusLine,
     position_words,
     prefer_option,
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from tooltip_cli.stages.watch import Counts, Update, WatchOptions, WatchStatus
 
 _Command = TypeVar("_Command", bound=Callable[..., object])
-Prefer = tuple[float, float, float]
 _DEFAULT = "recording"
 
 

@@ -115,6 +115,7 @@ def turn_deg(hand_from_camera: Array) -> Array:
 
 def frame_table(
     views: Views,
+    seen_by: Views,
     test: Indices,
     states: Mapping[int, str],
     labels: MatchedLabels | None,
@@ -125,6 +126,7 @@ def frame_table(
     """Collect what is known of every test frame.
 
     Args:
+        seen_by: views that the estimate from detections is by.
         test: (T,) image indices.
         states: of the labelled frames, by image index.
         tips: ``detections`` and ``labels`` -> (3,) estimate, metres, hand frame; None: refused.
@@ -136,8 +138,9 @@ def frame_table(
         column[frames] = values
         return column[test]
 
-    def projected(tip: Array | None) -> Array:
-        return np.full((len(test), 2), np.nan) if tip is None else project_tip(views, tip, test)
+    def projected(name: str, by: Views) -> Array:
+        tip = tips.get(name)
+        return np.full((len(test), 2), np.nan) if tip is None else project_tip(by, tip, test)
 
     seen = detections.tip_pixels()
     shown = None if labels is None else labels.visible
@@ -149,8 +152,8 @@ def frame_table(
         label=nothing if shown is None else spread(shown.frames, shown.pixels),
         detection=spread(seen.frames, seen.pixels),
         weight=spread(seen.frames, seen.weights),
-        prediction=projected(tips.get("detections")),
-        baseline=projected(tips.get("labels")),
+        prediction=projected("detections", seen_by),
+        baseline=projected("labels", views),
         truth=nothing if truth is None else truth.pixels[test],
         turn_deg=turn_deg(views.hand_from_camera)[test],
     )

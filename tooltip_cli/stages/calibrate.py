@@ -13,21 +13,17 @@ from tooltip_cli.errors import RefusedError, TooltipError
 from tooltip_cli.log.recording import Recording, Topics, read_recording
 from tooltip_cli.log.views import Views, corrected_rig, resolve_rig, resolve_views
 from tooltip_cli.log.whole import write_file
-from tooltip_cli.method.rays import sphere_array
-from tooltip_cli.method.types import Array, Correction, Refinement
+from tooltip_cli.method.types import Array, Correction, Refinement, TipEstimate
 from tooltip_cli.method.voting.calibrate import PosesAt, Seen
 from tooltip_cli.method.voting.calibrate import calibrate as solve
-from tooltip_cli.method.voting.ends import first_end
-from tooltip_cli.method.voting.estimate import check_motion
+from tooltip_cli.method.voting.ends import ClosePart, first_end
 from tooltip_cli.method.voting.pairing import Pairing
 from tooltip_cli.method.voting.params import VotingSettings
-from tooltip_cli.method.voting.volume import HandEdges
 from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.rig.rigfile import Rig, rig_files
 from tooltip_cli.stages.artifacts import ensure_directory
 from tooltip_cli.stages.held_out import unlabelled
-from tooltip_cli.stages.moving import detect_edges_in
-from tooltip_cli.stages.voting import hand_edges, pair_views
+from tooltip_cli.stages.voting import gather_votes
 
 
 @dataclass(frozen=True)
@@ -79,20 +75,17 @@ def calibrate(
         own = resolve_rig(recording, rig)
         views = resolve_views(recording, own)
         allowed = unlabelled(recording, views.camera, out)
-        pairing, poses = pair_views(views, settings, allowed)
-        reason = check_motion(pairing, poses, settings)
-        end = None
-        if reason is None:
-            detected = detect_edges_in(
-                recording, views, pairing, settings, out=out, jobs=jobs, on_frame=on_frame
-            )
-            spheres = sphere_array([(sphere.center, sphere.radius) for sphere in views.spheres])
-            edges = hand_edges(views, detected.edges, poses, settings)
-            end = seen_end(recording, own, edges, pairing, spheres, settings)
-        if end is None:
-            left_out.append((path, "shows no tool" if reason is None else reason.text))
+        votes = gather_votes(
+            recording, views, settings, allowed, out=out, jobs=jobs, on_frame=on_frame
+        )
+        if isinstance(votes, TipEstimate):
+            left_out.append((path, votes.reasons[0].text))
             continue
-        seen.append(end)
+        part = first_end(votes.seen_by(views, settings), votes.spheres, settings)
+        if part is None:
+            left_out.append((path, "shows no tool"))
+            continue
+        seen.append(seen_part(recording, own, votes.pairing, part))
         used.append(path)
         rigs.append((recording, own))
     found = solve(seen, camera, settings.calibration, settings.refine) if seen else None
@@ -108,59 +101,48 @@ def calibrate(
     return Calibrated(found, first, tuple(used), tuple(left_out))
 
 
-def refine_rig(
-    recording: Recording,
-    rig: Rig,
-    camera: bool,
-    settings: VotingSettings,
-    edges: HandEdges,
-    pairing: Pairing,
-    spheres: Array,
-) -> Refinement | None:
-    """Find what one recording says about its rig; None: it shows no tool's end."""
-    end = seen_end(recording, rig, edges, pairing, spheres, settings)
-    return None if end is None else solve([end], camera, settings.calibration, settings.refine)
-
-
 def put_right(recording: Recording, rig: Rig, correction: Correction) -> Rig:
     """Return the rig with a correction."""
     camera = None if correction.rotation is None else correction.corrected_from_camera
     return corrected_rig(recording, rig, correction.time_offset, camera)
 
 
-def seen_end(
-    recording: Recording,
-    rig: Rig,
-    edges: HandEdges,
-    pairing: Pairing,
-    spheres: Array,
-    settings: VotingSettings,
-) -> Seen | None:
-    """Return the first end of a recording's tool with the poses at shifted stamps; None: none."""
-    end = first_end(edges, spheres, settings)
-    if end is None:
-        return None
-    return Seen(end.near, _poses_at(recording, rig, pairing), end.position, end.axis, end.radius)
+def rig_of(
+    recording: Recording, rig: Rig, views: Views, found: Refinement | None
+) -> tuple[Rig, Views]:
+    """Return the rig and views that an estimate is by: put right where it is said to be."""
+    if found is None or not found.applied:
+        return rig, views
+    better = put_right(recording, rig, found.correction)
+    return better, resolve_views(recording, better)
+
+
+def seen_part(recording: Recording, rig: Rig, pairing: Pairing, part: ClosePart) -> Seen:
+    """Return a tool's end with the poses at shifted stamps."""
+    poses_at = _poses_at(recording, rig, pairing)
+    return Seen(part.near, poses_at, part.position, part.axis, part.radius)
 
 
 def _poses_at(recording: Recording, rig: Rig, pairing: Pairing) -> PosesAt:
     """Return the chosen frames' poses at shifted stamps; where joints end, the unshifted ones."""
-    start = _chosen(resolve_views(recording, rig), pairing)
+    stamps = recording.image_stamps_ns[pairing.frames]
+    recording = replace(recording, image_stamps_ns=stamps)
     known: dict[int, Array] = {}
+
+    def poses_by(rig: Rig) -> Array:
+        return inverse_transform(resolve_views(recording, rig).hand_from_camera)
+
+    start = poses_by(rig)
 
     def poses_at(offset_s: float) -> Array:
         shift_ns = round(offset_s * 1e9)
         if shift_ns not in known:
             shifted = replace(rig, time_offset_s=rig.time_offset_s + shift_ns / 1e9)
-            poses = _chosen(resolve_views(recording, shifted), pairing)
+            poses = poses_by(shifted)
             known[shift_ns] = np.where(np.isfinite(poses), poses, start)
         return known[shift_ns]
 
     return poses_at
-
-
-def _chosen(views: Views, pairing: Pairing) -> Array:
-    return inverse_transform(views.hand_from_camera[pairing.frames])
 
 
 def refinement_document(found: Refinement) -> dict[str, Any]:
@@ -182,6 +164,24 @@ def refinement_document(found: Refinement) -> dict[str, Any]:
         "support_before": found.support_before,
         "support_after": found.support_after,
     }
+
+
+def refinement_sentence(refined: dict[str, Any]) -> str:
+    """Say in words what was found out about clocks and camera."""
+    text = (
+        f"image clock {1000 * refined['time_offset_s']:+.1f} +-"
+        f"{1000 * refined['time_offset_std_s']:.1f} ms"
+    )
+    camera = refined["camera"]
+    if camera is not None:
+        turn = sum(value**2 for value in camera["rotation_deg"]) ** 0.5
+        step = 1000 * sum(value**2 for value in camera["translation_m"]) ** 0.5
+        text += f", camera turned by {turn:.2f} degrees and moved by {step:.1f} mm"
+    shares = (
+        f"{refined['support_before']:.0%} of what the images could show of the tool's end fits "
+        f"without and {refined['support_after']:.0%} with it"
+    )
+    return f"{text}: {'used' if refined['applied'] else 'not used'}; {shares}"
 
 
 def refinement_from_document(document: dict[str, Any]) -> Refinement:

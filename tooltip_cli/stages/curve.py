@@ -56,7 +56,7 @@ def training_curve(case: Case, table: FrameTable, report_dir: Path) -> Iterator[
     tips = _tips(case, sizes, report_dir)
     points = [*tips.items(), (_used(case), [final.position])]
     yield from (
-        _training_point(size, found, final.position, case.views, table) for size, found in points
+        _training_point(size, found, final.position, case.seen_by, table) for size, found in points
     )
 
 
@@ -119,7 +119,7 @@ def _detections(case: Case) -> tuple[Indices, EstimateOn]:
 
 def _votes(case: Case) -> tuple[Indices, EstimateOn]:
     """Return the frames that vote, and the estimate from some of them."""
-    settings, views = case.protocol.params.voting, case.views
+    settings, views = case.protocol.params.voting, case.seen_by
     voted = None if case.voters is None else case.voters.edges()
     if voted is None:
         return case.split.train[:0], lambda frames: None

@@ -20,17 +20,12 @@ from tooltip_cli.method.detector import FEW_EDGES, NO_MOTION, Detections, Detect
 from tooltip_cli.method.estimators import EstimationInput, EstimatorParams, estimate_tip
 from tooltip_cli.method.rays import rays_in_hand, sphere_array
 from tooltip_cli.method.types import (
-    Array,
     Candidate,
     Reason,
-    Refinement,
     TipEstimate,
     TipPixels,
     refused,
 )
-from tooltip_cli.method.voting.estimate import less_sure
-from tooltip_cli.method.voting.pairing import Pairing
-from tooltip_cli.method.voting.volume import HandEdges
 from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.stages.artifacts import (
@@ -43,22 +38,18 @@ from tooltip_cli.stages.artifacts import (
     stage_key,
     write_whole,
 )
-from tooltip_cli.stages.calibrate import (
-    put_right,
-    refine_rig,
-    refinement_document,
-    refinement_from_document,
-)
+from tooltip_cli.stages.calibrate import refinement_document, refinement_from_document
 from tooltip_cli.stages.clock import laps
 from tooltip_cli.stages.detect import Detected, detect_in
 from tooltip_cli.stages.held_out import unlabelled
+from tooltip_cli.stages.memory import give_back_large_arrays
 from tooltip_cli.stages.moving import VERSION as EDGES_VERSION
 from tooltip_cli.stages.moving import DetectedEdges
 from tooltip_cli.stages.near import near_unless
-from tooltip_cli.stages.voting import vote
+from tooltip_cli.stages.refined import vote
 
 SUFFIX = ".tip.json"
-VERSION = 8
+VERSION = 9
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -84,7 +75,6 @@ def estimate(
     detector: DetectorParams | None = None,
     preset: str = "voting",
     from_labels: Path | None = None,
-    refine: str | None = None,
     out: Path | None = None,
     force: bool = False,
     jobs: int = 1,
@@ -100,12 +90,11 @@ def estimate(
         preset: ``voting`` or ``paper``: whether detections, where the method takes them, are looked
             for near the hand or among all edges.
         from_labels: a label file to estimate from instead of detections (the paper's baseline).
-        refine: ``time`` or ``all``: put clocks, or clocks and camera, right where that helps; for
-            the method ``voting`` and from images alone.
 
     Raises:
         TooltipError: anything wrong with the inputs.
     """
+    give_back_large_arrays()  # half of what is held is, and may be needed twice
     lap = laps()
     recording = read_recording(recording_path, topics or Topics())
     lap("read")
@@ -120,12 +109,12 @@ def estimate(
         allowed = unlabelled(recording, views.camera, out)
         found = estimate_from_images(
             recording,
+            resolved,
             views,
             params,
             allowed,
             detector=detector,
             preset=preset,
-            refine=None if refine is None else (resolved, refine),
             out=out,
             force=force,
             jobs=jobs,
@@ -146,13 +135,13 @@ def _unknown_poses(views: Views) -> list[str]:
 
 def estimate_from_images(
     recording: Recording,
+    rig: Rig,
     views: Views,
     params: EstimatorParams,
     allowed: npt.NDArray[np.bool_],
     *,
     detector: DetectorParams | None = None,
     preset: str = "voting",
-    refine: tuple[Rig, str] | None = None,
     out: Path | None = None,
     detected_out: Path | None = None,
     force: bool = False,
@@ -162,9 +151,9 @@ def estimate_from_images(
     """Estimate from what moves in the allowed images, by the method that ``params`` names.
 
     Args:
+        rig: that the views are by.
         allowed: (N,) images that may be used; a detection belongs to its first image.
         detector: of the paper's methods, ``kmeans`` and ``map``; ``preset`` likewise.
-        refine: the rig that the views are by, and what of it to put right (see :func:`estimate`).
         detected_out: directory for what is detected; default: ``out``.
     """
     detected_out = detected_out or out
@@ -182,41 +171,21 @@ def estimate_from_images(
         )
     origin = {"recording": recording.sha256, "image_topic": recording.image_topic}
     parents = {**origin, "allowed": digest(allowed), "edges_version": str(EDGES_VERSION)}
-    if refine is not None:
-        parents["refine"] = refine[1]
     used: list[DetectedEdges] = []
 
     def compute() -> TipEstimate:
-        refinements: list[Refinement] = []
-
-        def better(edges: HandEdges, pairing: Pairing, spheres: Array) -> Views | None:
-            if refine is None:
-                return None
-            rig, what = refine
-            found = refine_rig(
-                recording, rig, what == "all", params.voting, edges, pairing, spheres
-            )
-            refinements.extend([] if found is None else [found])
-            if found is None or not found.applied:
-                return None
-            return resolve_views(recording, put_right(recording, rig, found.correction))
-
         result, edges = vote(
             recording,
+            rig,
             views,
             params.voting,
             allowed,
             out=detected_out,
             jobs=jobs,
             on_frame=on_pair,
-            put_right=better,
         )
         used.extend([] if edges is None else [edges])
-        if not refinements:
-            return result
-        (tip_covariance,) = refinements[0].tip_covariances
-        result = less_sure(result, tip_covariance, params.voting.trust)
-        return replace(result, refinement=refinements[0])
+        return result
 
     found = _estimate(recording, views, compute, parents, params, out, force)
     return Estimated(*found, used[0] if used else None)

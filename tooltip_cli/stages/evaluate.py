@@ -43,6 +43,7 @@ from tooltip_cli.stages.artifacts import (
     stage_key,
     write_whole,
 )
+from tooltip_cli.stages.calibrate import rig_of
 from tooltip_cli.stages.detect import Detected, detect_in
 from tooltip_cli.stages.estimate import (
     Estimated,
@@ -55,7 +56,7 @@ from tooltip_cli.stages.memory import give_back_freed, give_back_large_arrays
 from tooltip_cli.stages.near import near_unless
 from tooltip_cli.stages.shape import Voters, voted_shape
 
-VERSION = 5
+VERSION = 6
 DEFAULT_DIRECTORY = "report"
 _LOGGER = logging.getLogger(__name__)
 
@@ -225,10 +226,9 @@ def evaluate_recording(
     on_step(path, f"{_how(detected.reused)} {detected.path}")
     tips = places.report / "tips"
     allowed = np.isin(np.arange(len(recording.image_stamps_ns)), split.train)
-    voting, edges_out = protocol.params.voting, places.out or tips / "detections"
-    voters = Voters(recording, views, allowed, voting, edges_out)
     estimate = estimate_from_images(
         recording,
+        rig,
         views,
         protocol.params,
         allowed,
@@ -240,7 +240,10 @@ def evaluate_recording(
         jobs=jobs,
     )
     found = {"detections": replace(estimate, detected=None)}  # edges take a tenth of a gigabyte
+    _, seen_by = rig_of(recording, rig, views, estimate.estimate.refinement)
     del estimate
+    voting, edges_out = protocol.params.voting, places.out or tips / "detections"
+    voters = Voters(recording, views, allowed, voting, edges_out, seen_by)
     if labelled is not None and len(labelled.labels.visible.frames):
         found["labels"] = estimate_from_labels(
             recording, views, labelled.labels, protocol.params, out=tips / "labels", force=force
@@ -250,7 +253,7 @@ def evaluate_recording(
     truth = read_truth(recording)
     scene = Scene(
         recording,
-        views,
+        seen_by,
         detected.detections,
         protocol.detector,
         protocol.preset,
@@ -271,6 +274,7 @@ def evaluate_recording(
         recording,
         rig,
         views,
+        seen_by,
         labelled,
         split,
         detected,

@@ -18,17 +18,16 @@ from tooltip_cli.log.scene import transform_stamped
 from tooltip_cli.log.views import Views, resolve_rig, resolve_urdf, resolve_views
 from tooltip_cli.log.whole import check_absent
 from tooltip_cli.method.estimators import EstimatorParams
-from tooltip_cli.method.types import Array
-from tooltip_cli.method.voting.estimate import check_motion
+from tooltip_cli.method.types import Array, TipEstimate
 from tooltip_cli.method.voting.params import VotingSettings
 from tooltip_cli.method.voting.volume import agreed_points, reconstruct
 from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.rig.tool_tip import TIP_LINK, urdf_with_tip
 from tooltip_cli.stages.artifacts import write_whole
+from tooltip_cli.stages.calibrate import rig_of
 from tooltip_cli.stages.estimate import Estimated, estimate_from_images
 from tooltip_cli.stages.held_out import unlabelled
-from tooltip_cli.stages.moving import detect_edges_in
-from tooltip_cli.stages.voting import hand_edges, pair_views
+from tooltip_cli.stages.voting import gather_votes
 
 _CLOUD_VOXEL = 0.004  # metres
 _CLOUD_FRAMES = 4  # that must agree on a point
@@ -39,8 +38,9 @@ class Result:
     """A recording with its estimate, which may be a refusal."""
 
     recording: Recording
-    rig: Rig
+    rig: Rig  # put right, where the estimate says so
     views: Views
+    given: Views  # by the rig as it is, as detections are
     estimated: Estimated
     preset: str = "voting"  # which detections it takes, as in `estimate_from_images`
 
@@ -83,6 +83,7 @@ def open_result(
     allowed = unlabelled(recording, views.camera, out)
     estimated = estimate_from_images(
         recording,
+        resolved,
         views,
         params or EstimatorParams(),
         allowed,
@@ -91,7 +92,8 @@ def open_result(
         jobs=jobs,
         on_pair=on_pair,
     )
-    return Result(recording, resolved, views, estimated, preset)
+    by = rig_of(recording, resolved, views, estimated.estimate.refinement)
+    return Result(recording, *by, views, estimated, preset)
 
 
 def export_urdf(result: Result, path: Path, *, overwrite: bool = False) -> None:
@@ -133,15 +135,11 @@ def export_cloud(
     """
     check_absent(path, overwrite=overwrite)
     settings = VotingSettings()
-    allowed = unlabelled(result.recording, result.views.camera, out)
-    pairing, poses = pair_views(result.views, settings, allowed)
-    reason = check_motion(pairing, poses, settings)
-    if reason is not None:
-        raise RefusedError(f"{result.recording.path} shows no shape: {reason.text}")
-    detected = detect_edges_in(
-        result.recording, result.views, pairing, settings, out=out, jobs=jobs
-    )
-    cloud = reconstruct(hand_edges(result.views, detected.edges, poses, settings), settings.voting)
+    allowed = unlabelled(result.recording, result.given.camera, out)
+    votes = gather_votes(result.recording, result.given, settings, allowed, out=out, jobs=jobs)
+    if isinstance(votes, TipEstimate):
+        raise RefusedError(f"{result.recording.path} shows no shape: {votes.reasons[0].text}")
+    cloud = reconstruct(votes.seen_by(result.views, settings), settings.voting)
     points, frames = agreed_points(cloud.points, cloud.frames, _CLOUD_VOXEL, _CLOUD_FRAMES)
     shade = 60 + 195 * np.minimum(frames / max(float(np.quantile(frames, 0.99)), 1.0), 1.0)
     colors = np.repeat(shade.astype(np.uint8)[:, None], 3, axis=1)

@@ -21,6 +21,7 @@ from tooltip_cli.log.views import resolve_rig, resolve_views
 from tooltip_cli.method.evaluation import split_frames
 from tooltip_cli.report.scoring import project_tip
 from tooltip_cli.stages.artifacts import artifact_path, ensure_directory, find_artifact, read_json
+from tooltip_cli.stages.calibrate import rig_of
 from tooltip_cli.stages.detect import SUFFIX as DETECTIONS_SUFFIX
 from tooltip_cli.stages.estimate import SUFFIX as TIP_SUFFIX
 from tooltip_cli.stages.estimate import estimate_from_document
@@ -174,10 +175,13 @@ def _predictions(
     document = read_json(place) if place is not None else None
     if place is None or not isinstance(document, dict):
         return {}
-    tip = estimate_from_document(document, place).position
+    estimate = estimate_from_document(document, place)
+    tip = estimate.position
     if tip is None or document["provenance"].get("recording_sha256") != recording.sha256:
         return {}
-    views = resolve_views(recording, resolve_rig(recording, rig))
+    given = resolve_rig(recording, rig)
+    views = resolve_views(recording, given)
+    _, views = rig_of(recording, given, views, estimate.refinement)
     frames = np.flatnonzero(views.known)
     return _by_frame(frames, project_tip(views, tip, frames))
 

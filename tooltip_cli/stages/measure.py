@@ -35,6 +35,7 @@ from tooltip_cli.report.scoring import (
 )
 from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.stages.artifacts import digest, plain, provenance
+from tooltip_cli.stages.calibrate import refinement_sentence
 from tooltip_cli.stages.curve import training_curve
 from tooltip_cli.stages.detect import Detected
 from tooltip_cli.stages.estimate import Estimated, estimation_input
@@ -72,6 +73,7 @@ class Case:
     recording: Recording
     rig: Rig
     views: Views
+    seen_by: Views  # that the estimate from detections is by: the same, or put right by it
     labelled: Labelled | None
     split: Split
     detected: Detected
@@ -88,6 +90,7 @@ def measure(case: Case, report_dir: Path) -> tuple[RecordingReport, FrameTable]:
     tips = {name: item.estimate.position for name, item in case.found.items()}
     table = frame_table(
         views,
+        case.seen_by,
         case.split.test,
         {} if labelled is None else labelled.states,
         None if labelled is None else labelled.labels,
@@ -129,8 +132,9 @@ def _score(case: Case, source: str, table: FrameTable, report_dir: Path) -> Esti
     item = case.found[source]
     path = item.path
     place = path.relative_to(report_dir) if path.is_relative_to(report_dir) else path
+    views = case.seen_by if source == "detections" else case.views
     return score_estimate(
-        source, item.estimate, item.document, case.views, table, case.truth, str(place)
+        source, item.estimate, item.document, views, table, case.truth, str(place)
     )
 
 
@@ -158,6 +162,12 @@ def _provenance(case: Case) -> dict[str, Any]:
 
 def _notes(case: Case, without_pose: int) -> tuple[str, ...]:
     notes = [*case.recording.notes, *case.split.notes]
+    refined = case.found["detections"].document.get("refined")
+    if refined is not None and refined["applied"]:
+        notes.append(
+            "the estimate from images puts the rig right, the baseline takes it as it is: "
+            f"{refinement_sentence(refined)}"
+        )
     if without_pose:
         notes.append(f"in {without_pose} test frames the hand's pose is unknown; they do not count")
     if case.labelled is None:

@@ -7,11 +7,11 @@ import sys
 from typing import Any
 
 _MMAP_THRESHOLD = -3  # M_MMAP_THRESHOLD of glibc's malloc.h
-_LARGE = 1 << 20  # bytes
+_LARGE = 8 << 20  # bytes
 
 
 def give_back_large_arrays() -> None:
-    """Let arrays above 1 MiB leave the process when they are freed.
+    """Let arrays above 8 MiB leave the process when they are freed.
 
     By itself glibc raises that threshold to 32 MiB as large arrays come and go, and then keeps
     them between the smaller things of the next recording: 100 MB after three.

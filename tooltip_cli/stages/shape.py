@@ -18,6 +18,7 @@ from tooltip_cli.method.voting.moving import MovingEdges
 from tooltip_cli.method.voting.params import VotingSettings
 from tooltip_cli.method.voting.volume import agreed_points, reconstruct
 from tooltip_cli.report.scenes import VotedShape
+from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.stages.artifacts import artifact_path, plain, read_json, stage_key, write_whole
 from tooltip_cli.stages.estimate import Estimated
 from tooltip_cli.stages.moving import detect_edges_in
@@ -41,6 +42,7 @@ class Voters:
     allowed: Mask  # (N,) images that may vote
     settings: VotingSettings
     detected_out: Path | None  # directory of what was detected; None: beside the recording
+    seen_by: Views  # that the estimate is by: ``views``, or put right by it
 
     def edges(self) -> tuple[MovingEdges, Array] | None:
         """Return the moving edges and (N, 4, 4) camera_from_hand; None: the motion shows nothing.
@@ -48,13 +50,13 @@ class Voters:
         Raises:
             TooltipError: the edges are not stored and cannot be made.
         """
-        pairing, camera_from_hand = pair_views(self.views, self.settings, self.allowed)
-        if check_motion(pairing, camera_from_hand, self.settings) is not None:
+        pairing, paired_by = pair_views(self.views, self.settings, self.allowed)
+        if check_motion(pairing, paired_by, self.settings) is not None:
             return None
         detected = detect_edges_in(
             self.recording, self.views, pairing, self.settings, out=self.detected_out
         )
-        return detected.edges, camera_from_hand
+        return detected.edges, inverse_transform(self.seen_by.hand_from_camera)
 
 
 def voted_shape(voters: Voters, estimated: Estimated, out: Path) -> VotedShape | None:
@@ -77,7 +79,7 @@ def voted_shape(voters: Voters, estimated: Estimated, out: Path) -> VotedShape |
         return None
     edges, camera_from_hand = voted
     frames = edges.frames[:: max(1, len(edges.frames) // _FRAMES)]
-    some = hand_edges(voters.views, edges.of_frames(frames), camera_from_hand, voters.settings)
+    some = hand_edges(voters.seen_by, edges.of_frames(frames), camera_from_hand, voters.settings)
     cloud = reconstruct(some, voters.settings.voting)
     least = max(2, round(_LEAST * len(frames)))
     points, seen = agreed_points(cloud.points, cloud.frames, _VOXEL, least)

@@ -86,7 +86,7 @@ def export_log(
     """
     check_absent(path, overwrite=overwrite)
     recording = result.recording
-    near = near_unless(result.preset, recording, result.views)
+    near = near_unless(result.preset, recording, result.given)
     detected = detect_in(recording, near=near, out=out, jobs=jobs, on_pair=on_pair)
     exported = Exported(path, detected=detected)
     beside = _BesideImages(result, detected, out)

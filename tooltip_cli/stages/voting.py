@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from tooltip_cli.log.recording import Recording
 from tooltip_cli.log.views import Views
 from tooltip_cli.method.rays import sphere_array
 from tooltip_cli.method.types import Array, Reason, TipEstimate, refused
-from tooltip_cli.method.voting.estimate import METHOD, check_motion, estimate_by_voting
+from tooltip_cli.method.voting.estimate import METHOD, check_motion
 from tooltip_cli.method.voting.moving import MovingEdges
 from tooltip_cli.method.voting.pairing import Pairing, pair_frames
 from tooltip_cli.method.voting.params import VotingSettings
@@ -41,7 +42,24 @@ def pair_views(
     )
 
 
-def vote(
+@dataclass(frozen=True)
+class Votes:
+    """What an estimate by voting is made from."""
+
+    pairing: Pairing
+    detected: DetectedEdges
+    spheres: Array  # (S, 4) centre and radius of hand and wrist, metres
+
+    def seen_by(self, views: Views, settings: VotingSettings) -> HandEdges:
+        """Return the edges as a rig sees them, be it the one that they were paired by or a better.
+
+        They take a tenth of a gigabyte, so they are made where they are needed.
+        """
+        poses = inverse_transform(views.hand_from_camera)
+        return hand_edges(views, self.detected.edges, poses, settings)
+
+
+def gather_votes(
     recording: Recording,
     views: Views,
     settings: VotingSettings,
@@ -49,14 +67,9 @@ def vote(
     *,
     out: Path | None,
     jobs: int,
-    on_frame: Callable[[], None],
-    put_right: Callable[[HandEdges, Pairing, Array], Views | None] = lambda *_: None,
-) -> tuple[TipEstimate, DetectedEdges | None]:
-    """Estimate the tip from the allowed images (N,); no edges where the motion shows nothing.
-
-    Args:
-        put_right: returns views by a better rig, given the edges, the pairing, which is kept, and
-            the hand's spheres (S, 4); None: this one is used.
+    on_frame: Callable[[], None] = lambda: None,
+) -> Votes | TipEstimate:
+    """Find what moves in the allowed images (N,), or refuse where the motion shows nothing.
 
     Raises:
         TooltipError: an image cannot be decoded, or the edges not written.
@@ -64,18 +77,13 @@ def vote(
     pairing, camera_from_hand = pair_views(views, settings, allowed)
     reason = check_motion(pairing, camera_from_hand, settings)
     if reason is not None:
-        return refused(METHOD, len(pairing.frames), reason), None
+        return refused(METHOD, len(pairing.frames), reason)
     detected = detect_edges_in(
         recording, views, pairing, settings, out=out, jobs=jobs, on_frame=on_frame
     )
     give_back_freed()  # voting is where the most is held
-    edges = hand_edges(views, detected.edges, camera_from_hand, settings)
     spheres = sphere_array([(sphere.center, sphere.radius) for sphere in views.spheres])
-    better = put_right(edges, pairing, spheres)
-    if better is not None:
-        poses = inverse_transform(better.hand_from_camera)
-        edges = hand_edges(better, detected.edges, poses, settings)
-    return estimate_by_voting(edges, spheres, settings), detected
+    return Votes(pairing, detected, spheres)
 
 
 def edges_for_voting(

@@ -8,10 +8,10 @@ Example:
 
 Simulated recordings are made once under ``--work`` and reused. A given recording needs
 STEM.labels.csv and, where it does not carry them, STEM.rig.yaml and STEM.truth.json beside it.
-``voting+time`` and ``voting+all`` are voting with ``--refine``; the tip is then projected by the
-refined rig. ``--preset`` is of the detections that ``kmeans`` and ``map`` take, and ``within``
-the part of them within 10 px of the true tip. ``--wrong`` makes every rig wrong: 1 degree, 5 mm and
-30 ms.
+``voting+none``, ``voting+time`` and ``voting+all`` are voting with ``--refine``; where it is used,
+the tip is projected by the refined rig. ``--preset`` is of the detections that ``kmeans`` and
+``map`` take, and ``within`` the part of them within 10 px of the true tip. ``--wrong`` makes every
+rig wrong: 1 degree, 5 mm and 30 ms.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ from tooltip_cli.log.views import Views, resolve_rig, resolve_views
 from tooltip_cli.method.estimators import EstimatorParams
 from tooltip_cli.method.evaluation import pixel_errors
 from tooltip_cli.method.types import Array, Correction, TipEstimate, TipPixels
+from tooltip_cli.method.voting.params import VotingSettings
 from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.sources.sim import TOOLS, SimParams
-from tooltip_cli.stages.calibrate import put_right
+from tooltip_cli.stages.calibrate import put_right, rig_of
 from tooltip_cli.stages.detect import Detected
 from tooltip_cli.stages.estimate import estimate_from_images, estimate_from_labels
 from tooltip_cli.stages.held_out import unlabelled
@@ -195,11 +196,11 @@ def _score(
         name, _, what = method.partition("+")
         found_all = estimate_from_images(
             recording,
+            rig,
             views,
-            EstimatorParams(method=name),
+            EstimatorParams(method=name, voting=VotingSettings(put_right=what or "auto")),
             unlabelled(recording, views.camera, None),
             preset=preset,
-            refine=(rig, what) if what else None,
             out=out / method,
             force=True,
         )
@@ -207,11 +208,10 @@ def _score(
         row = {"name": path.stem, "method": method, "seconds": time.perf_counter() - start}
         if isinstance(found_all.detected, Detected) and truth is not None:
             row["within"] = _share_within(found_all.detected.detections.tip_pixels(), views, truth)
-        refined, seen_by = found.refinement, views
-        if refined is not None:
+        refined = found.refinement
+        if refined is not None and refined.applied:
             row["offset_ms"] = 1000 * refined.correction.time_offset
-            if refined.applied:
-                seen_by = resolve_views(recording, put_right(recording, rig, refined.correction))
+        _, seen_by = rig_of(recording, rig, views, refined)
         rows.append({**row, **_errors(found, seen_by, labels.visible, truth)})
     return rows
 

@@ -25,6 +25,7 @@ PosesAt = Callable[[float], Array]
 """Return (F, 4, 4) camera_from_hand of the chosen frames with image stamps shifted, seconds."""
 
 _LOOSE_MOVE = 0.03  # metres that an end may move by while clocks and camera are put right
+_NO_LESS = 0.9  # share of the support without a correction, that a solution has with it
 _RATE_STEP_S = 0.004  # half the interval over which the hand's motion is differenced
 
 
@@ -52,10 +53,30 @@ def calibrate(
 ) -> Refinement | None:
     """Solve for what recordings of one robot share; None: no end can be fitted.
 
+    Where fewer frames fit with what was found than without, it is no solution: it is looked for
+    again with ends that are taken to be wider, and the best is returned.
+
     Args:
         camera: whether the camera's pose may be corrected besides the clocks' offset. It is where
             clearly more frames fit with than without.
     """
+    best: Refinement | None = None
+    for factor in params.radius_factors:
+        scaled = [replace(seen, radius=factor * seen.radius) for seen in recordings]
+        found = _calibrated(scaled, camera, params, refine)
+        if found is None:
+            continue
+        if best is None or found.support_after > best.support_after:
+            best = found
+        if found.support_after > _NO_LESS * found.support_before:
+            break
+    return best
+
+
+def _calibrated(
+    recordings: Sequence[Seen], camera: bool, params: CalibrationParams, refine: RefineParams
+) -> Refinement | None:
+    """Solve once."""
     start = _fits_without(recordings, refine)
     if all(fit is None for fit in start):
         return None

@@ -44,6 +44,7 @@ class FoundEnd:
     agreement: float  # share of what the images show of it that fits; 0: too few images do
     by_grip: bool = False  # whether only its distance from the grip makes it an end
     by_outlines: bool = False  # whether silhouettes say where it is, rather than moving edges
+    radius: float = 0.0  # metres, roughly
 
 
 @dataclass(frozen=True)
@@ -202,12 +203,26 @@ def _confirmed(hull: Shape, shape: Shape, *within: float) -> list[Shape]:
 
 @dataclass(frozen=True)
 class ClosePart:
-    """The tool's first end, roughly, with all edges about it."""
+    """An end of the tool, roughly, with all edges about it."""
 
     near: NearEdges
     position: Array  # (3,) metres, hand frame
     axis: Array  # (3,) unit vector, hand frame
     radius: float  # metres
+
+
+def close_part(
+    edges: HandEdges, cloud: Cloud, end: FoundEnd, params: RefineParams
+) -> ClosePart | None:
+    """Return an end with what it was found from; None: it has no axis."""
+    position, axis = end.candidate.position, end.candidate.axis
+    if axis is None:
+        return None
+    if end.by_outlines and edges.silhouettes is not None:
+        near = near_outlines(edges.silhouettes, position, params)
+    else:
+        near = near_edges(edges, cloud, position, params)
+    return ClosePart(near, position, axis, end.radius)
 
 
 def first_end(edges: HandEdges, spheres: Array, settings: VotingSettings) -> ClosePart | None:
@@ -268,7 +283,7 @@ def _by_outlines(
     covariance = refined.position_covariance + doubt * np.eye(3)
     refined = replace(refined, position_covariance=covariance)
     end = _refined(refined, fit.support(settings.refine), settings)
-    return replace(end, by_outlines=True)
+    return replace(end, by_outlines=True, radius=fit.radius)
 
 
 def _by_edges(
@@ -285,8 +300,9 @@ def _by_edges(
     )
     if refined is None:
         covariance = _voted_covariance(cloud, end, far, spheres, edges.reach, settings)
-        return FoundEnd(Candidate(end.position, end.support, covariance, end.axis), 0.0)
-    return _refined(refined, end.support, settings)
+        candidate = Candidate(end.position, end.support, covariance, end.axis)
+        return FoundEnd(candidate, 0.0, radius=end.radius)
+    return replace(_refined(refined, end.support, settings), radius=end.radius)
 
 
 def _refined(end: RefinedEnd, support: float, settings: VotingSettings) -> FoundEnd:

@@ -13,6 +13,7 @@ from tooltip_cli.method.voting.pairing import Pairing, displacement, probe_pixel
 from tooltip_cli.method.voting.params import PairingParams, TrustParams, VotingSettings
 
 if TYPE_CHECKING:
+    from tooltip_cli.method.voting.ends import ClosePart
     from tooltip_cli.method.voting.volume import Cloud, HandEdges
 
 METHOD = "voting"
@@ -70,9 +71,23 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     Args:
         spheres: (S, 4) centre and radius of hand and wrist, metres.
     """
+    return estimate_or_doubt(edges, spheres, settings)[0]
+
+
+def estimate_or_doubt(
+    edges: HandEdges, spheres: Array, settings: VotingSettings
+) -> tuple[TipEstimate, ClosePart | None]:
+    """Estimate, and return the end with what is seen about it where the images disagree.
+
+    Args:
+        spheres: (S, 4) centre and radius of hand and wrist, metres.
+
+    Returns:
+        the estimate, and the end; None: the images agree, or the estimate is refused.
+    """
     # here, as whoever only looks whether the motion will do has no use for them
     from tooltip_cli.method.voting.end import tool_shape
-    from tooltip_cli.method.voting.ends import find_ends
+    from tooltip_cli.method.voting.ends import close_part, find_ends
     from tooltip_cli.method.voting.volume import reconstruct
 
     used = len(edges.moving.frames)
@@ -84,25 +99,32 @@ def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSetting
     faint = cloud.score < trust.min_score
     if not len(shape.voxels):
         weak = faint or clutter
-        return refused(METHOD, used, _nothing_consistent(cloud) if weak else _only_the_hand())
+        why = _nothing_consistent(cloud) if weak else _only_the_hand()
+        return refused(METHOD, used, why), None
     found = find_ends(edges, cloud, shape, spheres, settings)
     convincing = found[0].agreement >= trust.convincing_agreement
     # noise hides edges and spoils their matches; silhouettes need neither
     if (clutter and not convincing) or (faint and not (convincing and found[0].by_outlines)):
-        return refused(METHOD, used, _nothing_consistent(cloud))
+        return refused(METHOD, used, _nothing_consistent(cloud)), None
     candidates = [end.candidate for end in found]
     if settings.prefer is not None:
         candidates = [preferred(candidates, np.array(settings.prefer))]
     first = candidates[0]
     reason = _hidden(first.position, edges, trust)
     if reason is not None:
-        return refused(METHOD, used, reason)
-    agreement = next(end.agreement for end in found if end.candidate is first)
+        return refused(METHOD, used, reason), None
+    end = next(end for end in found if end.candidate is first)
+    agreement = end.agreement
     reasons = () if len(candidates) == 1 else (_ambiguous(candidates),)
     if agreement < trust.doubtful_agreement:
         reasons = (*reasons, _disagreeing(agreement))
     reasons = (*reasons, *_uncertain(first.covariance, trust, _OF_END))
-    return TipEstimate(METHOD, first.position, first.covariance, tuple(candidates), reasons, used)
+    found_tip = TipEstimate(
+        METHOD, first.position, first.covariance, tuple(candidates), reasons, used
+    )
+    if agreement >= trust.full_agreement:
+        return found_tip, None
+    return found_tip, close_part(edges, cloud, end, settings.refine)
 
 
 def less_sure(estimate: TipEstimate, covariance: Array, trust: TrustParams) -> TipEstimate:
@@ -184,8 +206,8 @@ def _disagreeing(agreement: float) -> Reason:
     return Reason(
         "images_disagree",
         (share if agreement else "the images show too little of the end")
-        + "; the clocks or the camera's pose may be off: --refine all, or tooltip calibrate, finds "
-        "out by how much",
+        + "; the clocks or the camera's pose may be off: tooltip calibrate, with several "
+        "recordings, finds out by how much",
     )
 
 

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+PUT_RIGHT = ("auto", "none", "time", "all")
+"""What of a rig may be put right: clocks and camera where the images disagree about the end,
+nothing, the clocks, or clocks and camera."""
+
 
 @dataclass(frozen=True)
 class PairingParams:
@@ -185,12 +189,14 @@ class CalibrationParams:
     time_prior: float = 0.03  # seconds, standard deviation of the clocks' offset
     rotation_prior_deg: float = 1.0  # of the camera about each axis
     translation_prior: float = 0.005  # metres, of the camera along each axis
+    radius_factors: tuple[float, ...] = (1.0, 2.0)  # of an end's, until there is a solution
     rounds: int = 10
     settled: float = 0.003  # of those deviations, smallest step worth another round
     certain: float = 3.0  # standard deviations that an offset must have to be used
     camera_gain: float = 0.05  # share of frames that must fit besides, for a camera's correction
     common_error: float = 10.0  # variance of what is wrong in all frames alike, over that of chance
     determined: float = 0.33  # of those deviations, largest that still determines a direction
+    agreement_gain: float = 0.05  # of what images show of the end, that must fit besides, unasked
 
 
 @dataclass(frozen=True)
@@ -212,7 +218,8 @@ class TrustParams:
     voted_floor_per_radius: float = 0.1  # the same, for each metre of the end's radius
     floor: float = 0.0005  # metres, standard deviation that no number of frames removes
     floor_px: float = 1.0  # the same in pixels; the larger holds
-    full_agreement: float = 0.8  # below this share of frames that fit, the floor rises
+    full_agreement: float = 0.8  # below this share of frames that fit, the floor rises, and whether
+    # clocks or camera are off is found out
     disagreement: float = 15.0  # by this factor for the whole share
     axis_floor_deg: float = 3.0  # standard deviation of the axis, at least
 
@@ -234,3 +241,4 @@ class VotingSettings:
     prefer: tuple[float, float, float] | None = (
         None  # direction of the end that is meant, hand frame
     )
+    put_right: str = "auto"  # one of `PUT_RIGHT`

@@ -220,6 +220,7 @@ def _through_the_stages(task: Task, bench: Bench) -> Outcome:
     views = resolve_views(recording, rig)
     found = estimate_from_images(
         recording,
+        rig,
         views,
         task.params,
         _not_labelled(recording, views, bench.labels),
