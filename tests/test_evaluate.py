@@ -112,6 +112,7 @@ def measured(
             recording,
             rig,
             views,
+            rig,
             views,
             Labelled(path, matched, states, describe_labels(path, "", matched, None)),
             split_by_labels(FRAMES, matched.frames),

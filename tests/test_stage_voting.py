@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,25 +14,33 @@ import numpy.typing as npt
 import pytest
 
 from tests.helpers.cli import Outcome, tooltip
+from tooltip_cli.errors import TooltipError
 from tooltip_cli.labels.files import read_labels
 from tooltip_cli.log.container import LoggedAttachment, iterate
 from tooltip_cli.log.detections import read_provenance
 from tooltip_cli.log.edges import read_edges
 from tooltip_cli.log.images import Image, decode_compressed
-from tooltip_cli.log.recording import Topics, read_recording
+from tooltip_cli.log.recording import Recording, Topics, read_recording
+from tooltip_cli.log.sync import interpolate
 from tooltip_cli.log.views import resolve_rig, resolve_views
+from tooltip_cli.method.estimators import EstimatorParams
 from tooltip_cli.method.rays import sphere_array
+from tooltip_cli.method.types import Candidate, TipEstimate, refused
 from tooltip_cli.method.voting.estimate import estimate_by_voting
 from tooltip_cli.method.voting.moving import MovingEdges
 from tooltip_cli.method.voting.params import TrustParams, VotingSettings
 from tooltip_cli.report.scoring import project_tip
 from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.rig.rigfile import load_rig
-from tooltip_cli.stages.calibrate import write_rig
+from tooltip_cli.stages.calibrate import put_right, write_rig
+from tooltip_cli.stages.estimate import estimate_from_images
 from tooltip_cli.stages.held_out import unlabelled
 from tooltip_cli.stages.label import find_hints
 from tooltip_cli.stages.moving import DetectedEdges, known_edges
+from tooltip_cli.stages.refined import gain
 from tooltip_cli.stages.voting import hand_edges, pair_views
+
+Stamps = npt.NDArray[np.int64]
 
 
 def simulate(path: Path, frames: int, size: str, motion: str = "sweep") -> Path:
@@ -323,6 +332,9 @@ def test_all_that_follows_is_by_the_clock_that_was_put_right(run: Run, tmp_path:
     assert row["baseline"]["error_px"] == as_it_is["baseline"]["error_px"]
     assert row["detector"]["error_px"]["mean"] < 0.7 * as_it_is["detector"]["error_px"]["mean"]
     assert row["detector"]["error_px"]["mean"] < row["baseline"]["error_px"]["mean"]
+    # of an error by the right clock, clocks have no part, and labels by it do no better
+    assert row["shares"]["clock_px"] < 0.2 < as_it_is["shares"]["clock_px"]
+    assert abs(row["shares"]["detection_px"]) < 1
     assert any("image clock" in note for note in row["notes"])
     assert not any("image clock" in note for note in as_it_is["notes"])
 
@@ -343,6 +355,92 @@ def test_all_that_follows_is_by_the_clock_that_was_put_right(run: Run, tmp_path:
         resolve_views(recording, load_rig(late)), tip, np.array(list(hints), dtype=np.intp)
     )
     assert np.nanmax(np.abs(unshifted - np.array(list(hints.values())))) > 1
+
+
+def with_joints(recording: Recording, kept: Callable[[Stamps], Stamps]) -> Recording:
+    """Return a recording with joints at chosen stamps, interpolated."""
+    joints = {}
+    for name, track in recording.joints.items():
+        stamps = kept(track.stamps_ns)
+        positions = interpolate(track.stamps_ns, track.positions, stamps, 10**9)
+        joints[name] = replace(track, stamps_ns=stamps, positions=positions)
+    return replace(recording, joints=joints)
+
+
+def estimate_late(recording: Recording, out: Path, put_right: str = "auto") -> TipEstimate:
+    """Estimate with image stamps that are put 30 ms too late."""
+    rig = replace(resolve_rig(recording, None), time_offset_s=0.03)
+    views = resolve_views(recording, rig)
+    allowed = np.ones(len(views.stamps_ns), dtype=bool)
+    params = EstimatorParams(voting=VotingSettings(put_right=put_right))
+    return estimate_from_images(recording, rig, views, params, allowed, out=out).estimate
+
+
+def test_images_whose_pose_is_unknown_by_the_right_clock_are_left_out(
+    first: Run, tmp_path: Path
+) -> None:
+    whole = read_recording(first.recording, Topics())
+    # by the wrong clock image 50 comes just after the gap, by the right one inside it
+    end = int(whole.image_stamps_ns[50]) + 15_000_000
+    gap = with_joints(whole, lambda t: t[(t < end - 135_000_000) | (t > end)])
+    found = estimate_late(gap, tmp_path)
+    assert found.refinement is not None
+    assert found.refinement.applied
+    right = put_right(gap, replace(resolve_rig(gap, None), time_offset_s=0.03),
+                      found.refinement.correction)  # fmt: skip
+    known = resolve_views(gap, right).known
+    assert not known[50]
+    assert found.position is not None
+    off = found.position - truth(first.recording)["tip_in_hand_m"]
+    assert np.linalg.norm(off) < 0.004
+
+
+def test_still_views_keep_their_rig(
+    first: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tooltip_cli.log.views.MAX_GAP_NS", 60_000_000)
+    whole = read_recording(first.recording, Topics())
+    shown = whole.image_stamps_ns[::2] + 30_000_000  # poses are known there and nowhere else
+    still = with_joints(whole, lambda t: shown[(shown > t[0]) & (shown < t[-1])])
+    few = {
+        how: estimate_late(still, tmp_path / how, how) for how in ("auto", "time", "all", "none")
+    }
+    assert {found.status for found in few.values()} == {"ok"}
+    for how in ("time", "all"):
+        refinement = few[how].refinement
+        assert refinement is not None
+        assert refinement.correction.time_offset == 0
+
+
+def test_what_may_be_put_right_must_be_known(first: Run, tmp_path: Path) -> None:
+    with pytest.raises(TooltipError, match=r"unknown choice.*'off'; known: all, auto, none, time"):
+        estimate_late(read_recording(first.recording, Topics()), tmp_path, "off")
+
+
+def test_hints_do_not_put_another_rig_right(run: Run, tmp_path: Path) -> None:
+    late = late_rig(run, tmp_path / "late")
+    done = tooltip("estimate", run.recording, "--rig", late, "--json")
+    tip = np.array(json.loads(done.out)["tip"]["position_m"])
+    recording = read_recording(run.recording, Topics())
+    hints = find_hints(recording, None, None).predictions  # by the rig in the recording
+    (frame, *_) = hints
+    seen = project_tip(
+        resolve_views(recording, resolve_rig(recording, None)), tip, np.array([frame])
+    )
+    np.testing.assert_allclose(hints[frame], seen[0], atol=0.01)
+
+
+def test_a_rig_is_not_put_right_for_another_end() -> None:
+    def estimate(*ends: tuple[float, float]) -> TipEstimate:
+        found = tuple(
+            Candidate(np.array([x, 0.0, 0.0]), 1.0, agreement=agreement) for x, agreement in ends
+        )
+        return TipEstimate("voting", found[0].position, np.eye(3), found, (), 100)
+
+    doubted = estimate((0.2, 0.55), (-0.1, 0.85))
+    assert gain(doubted, estimate((0.205, 0.95))) == pytest.approx(0.4)
+    assert gain(doubted, estimate((-0.1, 0.85))) == pytest.approx(0.0)
+    assert gain(doubted, refused("voting", 100)) < 0
 
 
 def test_what_is_exported_is_the_estimate_that_was_asked_for(run: Run) -> None:

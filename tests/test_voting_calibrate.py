@@ -115,6 +115,7 @@ def test_what_stays_unknown_of_the_rig_is_said_of_the_tip(camera: bool, off: boo
         ([(0.6, 0.59)], 1, 0.59),  # nothing to put right
         ([(0.3, 0.1), (0.2, 0.6)], 2, 0.6),
         ([(0.3, 0.2), (0.2, 0.1)], 2, 0.2),
+        ([(0.6, 0.4), (0.2, 0.45)], 2, 0.45),  # but less than without any correction
         ([None, (0.2, 0.6)], 2, 0.6),
     ],
 )
@@ -129,12 +130,17 @@ def test_what_is_no_solution_is_looked_for_with_wider_ends(
     def solved(recordings: list[Seen], *_: object) -> Refinement | None:
         radii.append(recordings[0].radius)
         support = supports[len(radii) - 1]
-        return support and Refinement(Correction(), np.ones(1), True, *support)
+        if support is None:
+            return None
+        return Refinement(Correction(), np.ones(1), support[1] > support[0], *support)
 
     monkeypatch.setattr("tooltip_cli.method.voting.calibrate._calibrated", solved)
     found = calibrate([recording(0.0, Correction(), 3)], False, PARAMS, REFINE)
     assert found is not None
     assert found.support_after == best
+    solved_first = next(pair for pair in supports if pair is not None)
+    assert found.support_before == solved_first[0]
+    assert found.applied == (found.support_after > found.support_before)
     assert radii == [0.006, 0.012][:tried]
 
 

@@ -97,6 +97,7 @@ def export(
       tooltip export pliers.mcap --cloud pliers.ply
     """
     from tooltip_cli.log.recording import Topics
+    from tooltip_cli.stages.calibrate import refinement_sentence
     from tooltip_cli.stages.export import (
         export_cloud,
         export_urdf,
@@ -122,6 +123,9 @@ def export(
         )
     how = "reused" if result.estimated.reused else "computed"
     say(f"{recording}: {how} {result.estimated.path}")
+    refined = result.estimated.document.get("refined")
+    if refined is not None:
+        say(f"{recording}: {refinement_sentence(refined)}")
     document: dict[str, object] = {"recording": str(recording)}
     tell = (lambda text: None) if as_json else click.echo
     if target is not None:

@@ -64,7 +64,8 @@ class Scene:
     """A recording with all that its figures are drawn from."""
 
     recording: Recording
-    views: Views
+    views: Views  # that the estimate from detections is by
+    given: Views  # that the baseline is by: the same, or before the rig was put right
     detections: Detections
     detector: DetectorParams
     preset: str  # voting or paper, as in `stages.evaluate`

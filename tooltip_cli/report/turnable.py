@@ -61,8 +61,8 @@ def rays_figure(row: RecordingReport, scene: Scene) -> Drawing | None:
     center, radius = _frame(row)
     panels = [
         _voted(row, scene, center, radius),
-        _panel("training, by detection", train, row.detector, scene, center, radius),
-        _panel("test, by label", labels, row.baseline, scene, center, radius),
+        _panel("training, by detection", train, row.detector, scene, scene.views, center, radius),
+        _panel("test, by label", labels, row.baseline, scene, scene.given, center, radius),
     ]
     shown = [panel for panel in panels if panel is not None]
     if not shown:
@@ -170,10 +170,11 @@ def _panel(
     pixels: TipPixels | None,
     estimate: EstimateScore | None,
     scene: Scene,
+    views: Views,
     center: Array,
     radius: float,
 ) -> Panel | None:
-    rays = None if pixels is None else viewing_rays(scene.views, pixels)
+    rays = None if pixels is None else viewing_rays(views, pixels)
     if rays is None or not len(rays):
         return None
     params: EstimatorParams = scene.estimator

@@ -182,6 +182,8 @@ def prefer_command(row: RecordingReport, end: CandidateScore) -> str:
     """Return the command line that takes this one of several ends."""
     rig = str(row.provenance["rig"]["source"])
     given = "" if rig.endswith(STORED_RIG) else f" --rig {shlex.quote(rig)}"
+    refine = row.provenance["rig"].get("refine", "auto")
+    given += "" if refine == "auto" else f" --refine {refine}"
     direction = ",".join(f"{value:.3f}" for value in end.position_m)
     return f"tooltip estimate {shlex.quote(row.recording)}{given} --prefer={direction}"
 
@@ -327,7 +329,7 @@ def caveats(report: EvaluationReport) -> Iterator[str]:
     if any(row.baseline_px for row in rows):
         yield (
             "The baseline is scored on the same labels that it was fitted to, as in the paper; it "
-            "is a lower bound for what these labels and this calibration allow, not a competitor."
+            "is a lower bound for what these labels and the rig as it is allow, not a competitor."
         )
     if any(row.labels and row.labels.simulated for row in rows):
         yield (

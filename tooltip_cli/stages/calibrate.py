@@ -138,7 +138,10 @@ def _poses_at(recording: Recording, rig: Rig, pairing: Pairing) -> PosesAt:
         shift_ns = round(offset_s * 1e9)
         if shift_ns not in known:
             shifted = replace(rig, time_offset_s=rig.time_offset_s + shift_ns / 1e9)
-            poses = poses_by(shifted)
+            try:
+                poses = poses_by(shifted)
+            except TooltipError:  # still views: no pose is known between them
+                poses = start
             known[shift_ns] = np.where(np.isfinite(poses), poses, start)
         return known[shift_ns]
 
@@ -181,7 +184,8 @@ def refinement_sentence(refined: dict[str, Any]) -> str:
         f"{refined['support_before']:.0%} of what the images could show of the tool's end fits "
         f"without and {refined['support_after']:.0%} with it"
     )
-    return f"{text}: {'used' if refined['applied'] else 'not used'}; {shares}"
+    used = "used" if refined["applied"] else "not used, as too little speaks for it"
+    return f"{text}: {used}; {shares}"
 
 
 def refinement_from_document(document: dict[str, Any]) -> Refinement:

@@ -42,7 +42,6 @@ from tooltip_cli.stages.calibrate import refinement_document, refinement_from_do
 from tooltip_cli.stages.clock import laps
 from tooltip_cli.stages.detect import Detected, detect_in
 from tooltip_cli.stages.held_out import unlabelled
-from tooltip_cli.stages.memory import give_back_large_arrays
 from tooltip_cli.stages.moving import VERSION as EDGES_VERSION
 from tooltip_cli.stages.moving import DetectedEdges
 from tooltip_cli.stages.near import near_unless
@@ -94,7 +93,6 @@ def estimate(
     Raises:
         TooltipError: anything wrong with the inputs.
     """
-    give_back_large_arrays()  # half of what is held is, and may be needed twice
     lap = laps()
     recording = read_recording(recording_path, topics or Topics())
     lap("read")
@@ -278,7 +276,8 @@ def _estimate(
                 return place, key, True, *stored
     result = compute()
     lap = laps()
-    document = tip_document(result, provenance(recording.path, recording.sha256, key, settings))
+    origin = provenance(recording.path, recording.sha256, key, settings)
+    document = tip_document(result, {**origin, "poses": parents["poses"]})
     path = artifact_path(recording.path, SUFFIX, out)
     write_whole(path, json.dumps(document, indent=1) + "\n")
     lap("write")

@@ -240,7 +240,7 @@ def evaluate_recording(
         jobs=jobs,
     )
     found = {"detections": replace(estimate, detected=None)}  # edges take a tenth of a gigabyte
-    _, seen_by = rig_of(recording, rig, views, estimate.estimate.refinement)
+    seen_rig, seen_by = rig_of(recording, rig, views, estimate.estimate.refinement)
     del estimate
     voting, edges_out = protocol.params.voting, places.out or tips / "detections"
     voters = Voters(recording, views, allowed, voting, edges_out, seen_by)
@@ -254,6 +254,7 @@ def evaluate_recording(
     scene = Scene(
         recording,
         seen_by,
+        views,
         detected.detections,
         protocol.detector,
         protocol.preset,
@@ -274,6 +275,7 @@ def evaluate_recording(
         recording,
         rig,
         views,
+        seen_rig,
         seen_by,
         labelled,
         split,

@@ -20,7 +20,13 @@ from tooltip_cli.log.recording import Recording, Topics, read_recording
 from tooltip_cli.log.views import resolve_rig, resolve_views
 from tooltip_cli.method.evaluation import split_frames
 from tooltip_cli.report.scoring import project_tip
-from tooltip_cli.stages.artifacts import artifact_path, ensure_directory, find_artifact, read_json
+from tooltip_cli.stages.artifacts import (
+    artifact_path,
+    digest,
+    ensure_directory,
+    find_artifact,
+    read_json,
+)
 from tooltip_cli.stages.calibrate import rig_of
 from tooltip_cli.stages.detect import SUFFIX as DETECTIONS_SUFFIX
 from tooltip_cli.stages.estimate import SUFFIX as TIP_SUFFIX
@@ -181,7 +187,9 @@ def _predictions(
         return {}
     given = resolve_rig(recording, rig)
     views = resolve_views(recording, given)
-    _, views = rig_of(recording, given, views, estimate.refinement)
+    if document["provenance"].get("poses") == digest(views.hand_from_camera):
+        # it is of this rig that the estimate says how to put it right
+        _, views = rig_of(recording, given, views, estimate.refinement)
     frames = np.flatnonzero(views.known)
     return _by_frame(frames, project_tip(views, tip, frames))
 

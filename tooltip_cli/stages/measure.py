@@ -73,7 +73,8 @@ class Case:
     recording: Recording
     rig: Rig
     views: Views
-    seen_by: Views  # that the estimate from detections is by: the same, or put right by it
+    seen_rig: Rig  # that the estimate from detections is by: the same, or put right by it
+    seen_by: Views
     labelled: Labelled | None
     split: Split
     detected: Detected
@@ -155,6 +156,7 @@ def _provenance(case: Case) -> dict[str, Any]:
         "hand_frame": case.rig.hand_frame,
         "camera": plain(case.views.camera),
         "time_offset_s": case.rig.time_offset_s,
+        "refine": case.protocol.params.voting.put_right,
         "poses_digest": digest(case.views.hand_from_camera),
     }
     return origin
@@ -165,8 +167,8 @@ def _notes(case: Case, without_pose: int) -> tuple[str, ...]:
     refined = case.found["detections"].document.get("refined")
     if refined is not None and refined["applied"]:
         notes.append(
-            "the estimate from images puts the rig right, the baseline takes it as it is: "
-            f"{refinement_sentence(refined)}"
+            f"the estimate from images puts the rig right: {refinement_sentence(refined)}"
+            + ("; the baseline takes it as it is" if "labels" in case.found else "")
         )
     if without_pose:
         notes.append(f"in {without_pose} test frames the hand's pose is unknown; they do not count")
@@ -204,9 +206,8 @@ def _clock_projection(case: Case, frames: Indices) -> Callable[[Array, float], A
 
     def project(tip: Array, offset_s: float) -> Array:
         if offset_s not in known:
-            shifted = replace(case.rig, time_offset_s=case.rig.time_offset_s + offset_s)
             try:
-                known[offset_s] = resolve_views(clipped, shifted)
+                known[offset_s] = resolve_views(clipped, _shifted(case.seen_rig, offset_s))
             except TooltipError:  # still views: no pose is known between them
                 known[offset_s] = None
         views = known[offset_s]
@@ -217,29 +218,47 @@ def _clock_projection(case: Case, frames: Indices) -> Callable[[Array, float], A
     return project
 
 
-def _clock_px(case: Case, table: FrameTable, offset_s: float, residual_px: float) -> float:
-    """Return what of the baseline's error goes when it is estimated anew with shifted stamps."""
+def _shifted(rig: Rig, offset_s: float) -> Rig:
+    return replace(rig, time_offset_s=rig.time_offset_s + offset_s)
+
+
+def _from_labels(case: Case, table: FrameTable, views: Views) -> tuple[Array, Array] | None:
+    """Return the tip that the labels give by some views, and the test frames' errors by them."""
     if case.labelled is None:
-        return 0.0
-    rig = replace(case.rig, time_offset_s=case.rig.time_offset_s + offset_s)
-    views = resolve_views(case.recording, rig)
+        return None
     seen = estimation_input(views, case.labelled.labels.visible)
     tip = estimate_tip(seen, case.protocol.params).position
     if tip is None:
+        return None
+    return tip, pixel_errors(project_tip(views, tip, table.frames), table.label)
+
+
+def _clock_px(case: Case, table: FrameTable, offset_s: float, residual_px: float) -> float:
+    """Return what of the labels' error goes when they are used anew with shifted stamps."""
+    views = resolve_views(case.recording, _shifted(case.seen_rig, offset_s))
+    found = _from_labels(case, table, views)
+    if found is None:
         return 0.0
-    errors = pixel_errors(project_tip(views, tip, table.frames), table.label)
-    return float(np.clip(residual_px - np.nanmean(errors), 0.0, residual_px))
+    return float(np.clip(residual_px - np.nanmean(found[1]), 0.0, residual_px))
 
 
 def _shares(case: Case, table: FrameTable) -> ErrorShares | None:
-    """Attribute the mean error to detection, to the clocks, and to calibration and labels."""
-    labels = case.found.get("labels")
-    prediction, baseline = table.prediction_error_px, table.baseline_error_px
+    """Attribute the mean error to detection, to the clocks, and to calibration and labels.
+
+    All by the rig that the estimate from detections is by, which may have put it right.
+    """
+    labels, prediction = case.found.get("labels"), table.prediction_error_px
     if labels is None or labels.estimate.position is None or not np.isfinite(prediction).any():
         return None
+    tip, baseline = labels.estimate.position, table.baseline_error_px
+    if case.seen_by is not case.views:
+        again = _from_labels(case, table, case.seen_by)
+        if again is None:
+            return None
+        tip, baseline = again
     scored = np.isfinite(baseline)
     project = _clock_projection(case, table.frames[scored])
-    fit = fit_clock(project, table.label[scored], labels.estimate.position)
+    fit = fit_clock(project, table.label[scored], tip)
     total, residual = float(np.nanmean(prediction)), float(np.nanmean(baseline))
     shown = fit is not None and fit.shown
     clock = _clock_px(case, table, fit.offset_s, residual) if fit and shown else 0.0

@@ -22,7 +22,7 @@ from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.stages.artifacts import artifact_path, plain, read_json, stage_key, write_whole
 from tooltip_cli.stages.estimate import Estimated
 from tooltip_cli.stages.moving import detect_edges_in
-from tooltip_cli.stages.voting import hand_edges, pair_views
+from tooltip_cli.stages.voting import hand_edges, known_to, pair_views
 
 SUFFIX = ".shape.json"
 VERSION = 1
@@ -56,7 +56,8 @@ class Voters:
         detected = detect_edges_in(
             self.recording, self.views, pairing, self.settings, out=self.detected_out
         )
-        return detected.edges, inverse_transform(self.seen_by.hand_from_camera)
+        edges = known_to(self.seen_by, detected.edges)
+        return edges, inverse_transform(self.seen_by.hand_from_camera)
 
 
 def voted_shape(voters: Voters, estimated: Estimated, out: Path) -> VotedShape | None:

@@ -56,7 +56,13 @@ class Votes:
         They take a tenth of a gigabyte, so they are made where they are needed.
         """
         poses = inverse_transform(views.hand_from_camera)
-        return hand_edges(views, self.detected.edges, poses, settings)
+        return hand_edges(views, known_to(views, self.detected.edges), poses, settings)
+
+
+def known_to(views: Views, edges: MovingEdges) -> MovingEdges:
+    """Return the edges of frames whose pose is known: by other clocks joints may be missing."""
+    known = views.known[edges.frames]
+    return edges if known.all() else edges.of_frames(edges.frames[known])
 
 
 def gather_votes(

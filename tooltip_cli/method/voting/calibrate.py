@@ -66,9 +66,13 @@ def calibrate(
         found = _calibrated(scaled, camera, params, refine)
         if found is None:
             continue
+        if best is not None:  # what it is measured by
+            before = best.support_before
+            helps = found.applied and found.support_after > before
+            found = replace(found, applied=helps, support_before=before)
         if best is None or found.support_after > best.support_after:
             best = found
-        if found.support_after > _NO_LESS * found.support_before:
+        if best.support_after > _NO_LESS * best.support_before:
             break
     return best
 
@@ -155,7 +159,8 @@ def _solved(
         # not quite what the equations say is wrong in all frames alike
         variances = sigmas**2
         scale = (np.diag(scatter) @ variances) / max(float(np.diag(information) @ variances), 1e-12)
-        prior = params.common_error * scale * np.diag(1.0 / variances)
+        # not nothing where frames say nothing, as of clocks of a hand that stands still
+        prior = params.common_error * max(float(scale), 1e-12) * np.diag(1.0 / variances)
         step = np.linalg.solve(information + prior, right - prior @ values)
         values = values + step
         fits = _refit(recordings, fits, values, loose)
@@ -263,6 +268,7 @@ def _determined(
     """
     scaled = np.linalg.inv(information * np.outer(sigmas, sigmas) + 1e-9 * np.eye(len(sigmas)))
     scores = params.common_error * scatter * np.outer(sigmas, sigmas)
+    scores += 1e-9 * np.eye(len(sigmas))  # what has no information is not known exactly
     covariance = scaled @ scores @ scaled
     variances, directions = np.linalg.eigh(covariance)
     known = variances < params.determined**2

@@ -218,8 +218,7 @@ class TrustParams:
     voted_floor_per_radius: float = 0.1  # the same, for each metre of the end's radius
     floor: float = 0.0005  # metres, standard deviation that no number of frames removes
     floor_px: float = 1.0  # the same in pixels; the larger holds
-    full_agreement: float = 0.8  # below this share of frames that fit, the floor rises, and whether
-    # clocks or camera are off is found out
+    full_agreement: float = 0.8  # of frames: below, the floor rises, clocks and camera are doubted
     disagreement: float = 15.0  # by this factor for the whole share
     axis_floor_deg: float = 3.0  # standard deviation of the axis, at least
 
