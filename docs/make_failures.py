@@ -57,9 +57,11 @@ def main() -> None:
 def drawn(path: Path, work: Path) -> bytes:
     """Estimate the tip of one recording and draw it beside the truth, as PNG."""
     recording = read_recording(path)
-    views = resolve_views(recording, resolve_rig(recording, None))
+    rig = resolve_rig(recording, None)
+    views = resolve_views(recording, rig)
     found = estimate_from_images(
         recording,
+        rig,
         views,
         EstimatorParams(method="voting"),
         unlabelled(recording, views.camera, None),
