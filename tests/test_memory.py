@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tooltip_cli.stages.memory import give_back_freed, give_back_large_arrays
+from tooltip_cli.stages.memory import MANY_RECORDINGS, give_back_freed, give_back_large_arrays
 
 
 def resident_mb():
@@ -22,7 +22,7 @@ def resident_mb():
 
 how, values = sys.argv[1], int(sys.argv[2])
 if how == "large":
-    give_back_large_arrays()
+    give_back_large_arrays(MANY_RECORDINGS)
 np.ones(3_000_000).sum()  # 24 MB: glibc's threshold rises above it when it goes
 before = resident_mb()
 kept = []
@@ -70,22 +70,22 @@ def test_freed_arrays_leave_the_process(how: str, values: int) -> None:
 def test_other_systems_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     import ctypes
 
-    from tooltip_cli.stages.memory import give_back_freed, give_back_large_arrays
+    from tooltip_cli.stages.memory import MANY_RECORDINGS, give_back_freed, give_back_large_arrays
 
     def forbidden(name: object) -> None:
         raise AssertionError("no C library is to be opened")
 
     monkeypatch.setattr(sys, "platform", "darwin")
     monkeypatch.setattr(ctypes, "CDLL", forbidden)
-    give_back_large_arrays()
+    give_back_large_arrays(MANY_RECORDINGS)
     give_back_freed()
 
 
 def test_another_c_library_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     import ctypes
 
-    from tooltip_cli.stages.memory import give_back_freed, give_back_large_arrays
+    from tooltip_cli.stages.memory import MANY_RECORDINGS, give_back_freed, give_back_large_arrays
 
     monkeypatch.setattr(ctypes, "CDLL", lambda name: object())
-    give_back_large_arrays()
+    give_back_large_arrays(MANY_RECORDINGS)
     give_back_freed()

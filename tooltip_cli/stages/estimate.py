@@ -42,6 +42,7 @@ from tooltip_cli.stages.calibrate import refinement_document, refinement_from_do
 from tooltip_cli.stages.clock import laps
 from tooltip_cli.stages.detect import Detected, detect_in
 from tooltip_cli.stages.held_out import unlabelled
+from tooltip_cli.stages.memory import ONE_RECORDING, give_back_large_arrays
 from tooltip_cli.stages.moving import VERSION as EDGES_VERSION
 from tooltip_cli.stages.moving import DetectedEdges
 from tooltip_cli.stages.near import near_unless
@@ -93,6 +94,7 @@ def estimate(
     Raises:
         TooltipError: anything wrong with the inputs.
     """
+    give_back_large_arrays(ONE_RECORDING)  # half of what is held, and it may be needed twice
     lap = laps()
     recording = read_recording(recording_path, topics or Topics())
     lap("read")

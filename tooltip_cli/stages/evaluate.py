@@ -52,7 +52,7 @@ from tooltip_cli.stages.estimate import (
 )
 from tooltip_cli.stages.held_out import LABELS_SUFFIX
 from tooltip_cli.stages.measure import Case, Labelled, Protocol, measure
-from tooltip_cli.stages.memory import give_back_freed, give_back_large_arrays
+from tooltip_cli.stages.memory import MANY_RECORDINGS, give_back_freed, give_back_large_arrays
 from tooltip_cli.stages.near import near_unless
 from tooltip_cli.stages.shape import Voters, voted_shape
 
@@ -137,7 +137,7 @@ def evaluate(
             written. With a single recording, whatever is wrong with it.
     """
     _check_names(recordings)
-    give_back_large_arrays()
+    give_back_large_arrays(MANY_RECORDINGS)
     params, detector = params or EstimatorParams(), detector or DetectorParams()
     protocol = Protocol(train, test, seed, split, params, detector, curve, preset)
     split_frames(train + test, train, test, seed, split)  # refuses wrong sizes before any work

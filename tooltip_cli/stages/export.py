@@ -27,6 +27,7 @@ from tooltip_cli.stages.artifacts import write_whole
 from tooltip_cli.stages.calibrate import rig_of
 from tooltip_cli.stages.estimate import Estimated, estimate_from_images
 from tooltip_cli.stages.held_out import unlabelled
+from tooltip_cli.stages.memory import ONE_RECORDING, give_back_large_arrays
 from tooltip_cli.stages.voting import gather_votes
 
 _CLOUD_VOXEL = 0.004  # metres
@@ -77,6 +78,7 @@ def open_result(
     Raises:
         TooltipError: anything wrong with the inputs.
     """
+    give_back_large_arrays(ONE_RECORDING)
     recording = read_recording(path, topics or Topics())
     resolved = resolve_rig(recording, rig)
     views = resolve_views(recording, resolved)

@@ -7,18 +7,22 @@ import sys
 from typing import Any
 
 _MMAP_THRESHOLD = -3  # M_MMAP_THRESHOLD of glibc's malloc.h
-_LARGE = 8 << 20  # bytes
+MANY_RECORDINGS = 1 << 20  # bytes
+ONE_RECORDING = 8 << 20  # bytes: nearly as little is held, and in a third of the time that it takes
 
 
-def give_back_large_arrays() -> None:
-    """Let arrays above 8 MiB leave the process when they are freed.
+def give_back_large_arrays(above: int) -> None:
+    """Let arrays above a size leave the process when they are freed.
 
     By itself glibc raises that threshold to 32 MiB as large arrays come and go, and then keeps
     them between the smaller things of the next recording: 100 MB after three.
+
+    Args:
+        above: bytes; `MANY_RECORDINGS` or `ONE_RECORDING`.
     """
     mallopt = _of_the_c_library("mallopt")
     if mallopt is not None:
-        mallopt(_MMAP_THRESHOLD, _LARGE)
+        mallopt(_MMAP_THRESHOLD, above)
 
 
 def give_back_freed() -> None:

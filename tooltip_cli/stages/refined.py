@@ -19,7 +19,7 @@ from tooltip_cli.method.voting.estimate import estimate_by_voting, estimate_or_d
 from tooltip_cli.method.voting.params import PUT_RIGHT, VotingSettings
 from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.stages.calibrate import rig_of, seen_part
-from tooltip_cli.stages.memory import give_back_freed, give_back_large_arrays
+from tooltip_cli.stages.memory import give_back_freed
 from tooltip_cli.stages.moving import DetectedEdges
 from tooltip_cli.stages.voting import Votes, gather_votes
 
@@ -46,7 +46,6 @@ def vote(
     """
     if settings.put_right not in PUT_RIGHT:
         raise TooltipError(one_of("choice of what to put right", settings.put_right, PUT_RIGHT))
-    give_back_large_arrays()  # half of what is held is, and it may be needed twice
     votes = gather_votes(recording, views, settings, allowed, out=out, jobs=jobs, on_frame=on_frame)
     if isinstance(votes, TipEstimate):
         return votes, None

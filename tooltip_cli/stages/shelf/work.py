@@ -27,6 +27,7 @@ from tooltip_cli.stages.estimate import Estimated, estimate_from_images
 from tooltip_cli.stages.evaluate import VERSION as EVALUATE_VERSION
 from tooltip_cli.stages.evaluate import Places, evaluate_recording
 from tooltip_cli.stages.measure import Protocol
+from tooltip_cli.stages.memory import MANY_RECORDINGS, give_back_large_arrays
 from tooltip_cli.stages.moving import VERSION as EDGES_VERSION
 from tooltip_cli.stages.near import VERSION as NEAR_VERSION
 from tooltip_cli.stages.shelf.plan import Item
@@ -214,6 +215,7 @@ def _one_thread() -> None:
 
 
 def _through_the_stages(task: Task, bench: Bench) -> Outcome:
+    give_back_large_arrays(MANY_RECORDINGS)
     started = time.perf_counter()
     recording = read_recording(bench.recording, task.topics)
     rig = resolve_rig(recording, bench.rig)
