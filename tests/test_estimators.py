@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import click
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from tests.helpers.scenes import TIP, input_of, looking_at, observe, poses_of
+from tooltip_cli.cli.estimate import estimate as command
 from tooltip_cli.cli.options import METHODS
 from tooltip_cli.errors import TooltipError
 from tooltip_cli.method import estimators
@@ -21,6 +23,7 @@ from tooltip_cli.method.estimators import (
 )
 from tooltip_cli.method.generative import Observations
 from tooltip_cli.method.types import Rays, TipEstimate
+from tooltip_cli.method.voting.params import PUT_RIGHT
 
 Array = npt.NDArray[np.float64]
 
@@ -49,6 +52,12 @@ def code_of(found: TipEstimate) -> str:
 def test_the_command_line_offers_every_method() -> None:
     assert estimators.METHODS == METHODS
     assert set(estimators.ESTIMATORS) < set(METHODS)
+
+
+def test_the_command_line_knows_what_may_be_put_right() -> None:
+    (kind,) = (item.type for item in command.params if item.name == "refine")
+    assert isinstance(kind, click.Choice)
+    assert tuple(kind.choices) == PUT_RIGHT
 
 
 def test_the_defaults_are_the_papers() -> None:

@@ -13,7 +13,6 @@ import numpy as np
 from tooltip_cli.log.views import Views
 from tooltip_cli.method.estimators import ESTIMATORS, estimate_tip
 from tooltip_cli.method.evaluation import pixel_errors
-from tooltip_cli.method.rays import sphere_array
 from tooltip_cli.method.types import Array, Indices
 from tooltip_cli.method.voting.estimate import METHOD as VOTING
 from tooltip_cli.method.voting.estimate import estimate_by_voting
@@ -21,7 +20,6 @@ from tooltip_cli.report.model import FrameTable, TrainingPoint
 from tooltip_cli.report.scoring import project_tip
 from tooltip_cli.stages.artifacts import artifact_path, plain, read_json, stage_key, write_whole
 from tooltip_cli.stages.estimate import estimation_input
-from tooltip_cli.stages.voting import hand_edges
 
 if TYPE_CHECKING:
     from tooltip_cli.stages.measure import Case
@@ -120,15 +118,14 @@ def _detections(case: Case) -> tuple[Indices, EstimateOn]:
 def _votes(case: Case) -> tuple[Indices, EstimateOn]:
     """Return the frames that vote, and the estimate from some of them."""
     settings, views = case.protocol.params.voting, case.seen_by
-    voted = None if case.voters is None else case.voters.edges()
-    if voted is None:
+    votes = None if case.voters is None else case.voters.votes()
+    if votes is None:
         return case.split.train[:0], lambda frames: None
-    edges, camera_from_hand = voted
-    spheres = sphere_array([(item.center, item.radius) for item in views.spheres])
+    edges = votes.known_to(views)
 
     def estimate_on(frames: Indices) -> Array | None:
-        chosen = hand_edges(views, edges.of_frames(frames), camera_from_hand, settings)
-        return estimate_by_voting(chosen, spheres, settings).position
+        chosen = votes.seen_by(views, settings, edges.of_frames(frames))
+        return estimate_by_voting(chosen, votes.spheres, settings).position
 
     return edges.frames, estimate_on
 

@@ -8,7 +8,7 @@ from typing import Any
 
 _MMAP_THRESHOLD = -3  # M_MMAP_THRESHOLD of glibc's malloc.h
 MANY_RECORDINGS = 1 << 20  # bytes
-ONE_RECORDING = 8 << 20  # bytes: nearly as little is held, and in a third of the time that it takes
+ONE_RECORDING = 8 << 20  # bytes: about as little is held, and fewer pages are taken anew
 
 
 def give_back_large_arrays(above: int) -> None:

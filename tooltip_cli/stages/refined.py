@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -49,81 +49,71 @@ def vote(
     votes = gather_votes(recording, views, settings, allowed, out=out, jobs=jobs, on_frame=on_frame)
     if isinstance(votes, TipEstimate):
         return votes, None
-    if settings.put_right in ("time", "all"):
-        found = _as_asked(recording, rig, views, votes, settings)
-    else:
-        found = _in_doubt(recording, rig, views, votes, settings)
-    return found, votes.detected
+    ballot = _Ballot(recording, rig, views, settings, votes)
+    asked = settings.put_right in ("time", "all")
+    return ballot.put_right_first() if asked else ballot.put_right_in_doubt(), votes.detected
 
 
-def _as_asked(
-    recording: Recording, rig: Rig, views: Views, votes: Votes, settings: VotingSettings
-) -> TipEstimate:
-    """Put right before anything is estimated, as what is asked for may be far off."""
-    part = first_end(votes.seen_by(views, settings), votes.spheres, settings)
-    camera = settings.put_right == "all"
-    found = (
-        None if part is None else _refinement(recording, rig, views, votes, part, settings, camera)
-    )
-    return _estimate(recording, rig, views, votes, found, settings)
+@dataclass(frozen=True)
+class _Ballot:
+    """What is voted on, and the rig that may be put right."""
 
+    recording: Recording
+    rig: Rig
+    views: Views  # by the rig
+    settings: VotingSettings
+    votes: Votes
 
-def _in_doubt(
-    recording: Recording, rig: Rig, views: Views, votes: Votes, settings: VotingSettings
-) -> TipEstimate:
-    """Put right where the images disagree about the end, and where they then clearly agree more.
+    def put_right_first(self) -> TipEstimate:
+        """Put right before anything is estimated, as what is asked for may be far off."""
+        seen = self.votes.seen_by(self.views, self.settings)
+        part = first_end(seen, self.votes.spheres, self.settings)
+        del seen
+        camera = self.settings.put_right == "all"
+        found, views = (None, self.views) if part is None else self.look_at(part, camera)
+        return self.estimate(views, found)
 
-    Nobody has said that the rig may be wrong, so nothing is made of it where that does not help.
-    """
-    estimate, part = estimate_or_doubt(votes.seen_by(views, settings), votes.spheres, settings)
-    if part is None or settings.put_right == "none":
-        return estimate
-    found = _refinement(recording, rig, views, votes, part, settings, camera=True)
-    if found is None:
-        return estimate
-    if found.applied:
-        better = _estimate(recording, rig, views, votes, found, settings)
-        if gain(estimate, better) > settings.calibration.agreement_gain:
-            return better
-    return replace(estimate, refinement=replace(found, applied=False))
+    def put_right_in_doubt(self) -> TipEstimate:
+        """Put right where the images disagree about the end, and then clearly agree more.
 
+        Nobody has said that the rig may be wrong: nothing is made of it where that does not help.
+        """
+        seen = self.votes.seen_by(self.views, self.settings)
+        estimate, part = estimate_or_doubt(seen, self.votes.spheres, self.settings)
+        del seen
+        if part is None or self.settings.put_right == "none":
+            return estimate
+        found, views = self.look_at(part, camera=True)
+        if found is None:
+            return estimate
+        if found.applied:
+            better = self.estimate(views, found)
+            if gain(estimate, better) > self.settings.calibration.agreement_gain:
+                return better
+        return replace(estimate, refinement=replace(found, applied=False))
 
-def _refinement(
-    recording: Recording,
-    rig: Rig,
-    views: Views,
-    votes: Votes,
-    part: ClosePart,
-    settings: VotingSettings,
-    camera: bool,
-) -> Refinement | None:
-    seen = seen_part(recording, rig, votes.pairing, part)
-    found = calibrate([seen], camera, settings.calibration, settings.refine)
-    if found is None or not found.applied:
-        return found
-    try:
-        rig_of(recording, rig, views, found)
-    except TooltipError:  # no joints were logged then
-        return replace(found, applied=False)
-    return found
+    def look_at(self, part: ClosePart, camera: bool) -> tuple[Refinement | None, Views]:
+        """Return what an end says of the rig, and the views by what of it is used."""
+        seen = seen_part(self.recording, self.rig, self.votes.pairing, part)
+        found = calibrate([seen], camera, self.settings.calibration, self.settings.refine)
+        if found is None:
+            return None, self.views
+        try:
+            _, views = rig_of(self.recording, self.rig, self.views, found)
+        except TooltipError:  # no joints were logged then
+            return replace(found, applied=False), self.views
+        return found, views
 
-
-def _estimate(
-    recording: Recording,
-    rig: Rig,
-    views: Views,
-    votes: Votes,
-    found: Refinement | None,
-    settings: VotingSettings,
-) -> TipEstimate:
-    """Estimate by the rig that was found, and add what that leaves unknown."""
-    give_back_freed()
-    _, views = rig_of(recording, rig, views, found)
-    estimate = estimate_by_voting(votes.seen_by(views, settings), votes.spheres, settings)
-    if found is None:
-        return estimate
-    (tip_covariance,) = found.tip_covariances
-    return replace(less_sure(estimate, tip_covariance, settings.trust), refinement=found)
+    def estimate(self, views: Views, found: Refinement | None) -> TipEstimate:
+        """Estimate by some views, and add what was found and what that leaves unknown."""
+        give_back_freed()
+        seen = self.votes.seen_by(views, self.settings)
+        estimate = estimate_by_voting(seen, self.votes.spheres, self.settings)
+        if found is None:
+            return estimate
+        (tip_covariance,) = found.tip_covariances
+        trust = self.settings.trust
+        return replace(less_sure(estimate, tip_covariance, trust), refinement=found)
 
 
 def gain(before: TipEstimate, after: TipEstimate) -> float:

@@ -11,18 +11,14 @@ import numpy as np
 
 from tooltip_cli.log.recording import Recording
 from tooltip_cli.log.views import Views
-from tooltip_cli.method.types import Array, Mask
+from tooltip_cli.method.types import Mask, TipEstimate
 from tooltip_cli.method.voting.estimate import METHOD as VOTING
-from tooltip_cli.method.voting.estimate import check_motion
-from tooltip_cli.method.voting.moving import MovingEdges
 from tooltip_cli.method.voting.params import VotingSettings
 from tooltip_cli.method.voting.volume import agreed_points, reconstruct
 from tooltip_cli.report.scenes import VotedShape
-from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.stages.artifacts import artifact_path, plain, read_json, stage_key, write_whole
 from tooltip_cli.stages.estimate import Estimated
-from tooltip_cli.stages.moving import detect_edges_in
-from tooltip_cli.stages.voting import hand_edges, known_to, pair_views
+from tooltip_cli.stages.voting import Votes, gather_votes
 
 SUFFIX = ".shape.json"
 VERSION = 1
@@ -44,20 +40,16 @@ class Voters:
     detected_out: Path | None  # directory of what was detected; None: beside the recording
     seen_by: Views  # that the estimate is by: ``views``, or put right by it
 
-    def edges(self) -> tuple[MovingEdges, Array] | None:
-        """Return the moving edges and (N, 4, 4) camera_from_hand; None: the motion shows nothing.
+    def votes(self) -> Votes | None:
+        """Return what the estimate is made from; None: the motion shows nothing.
 
         Raises:
             TooltipError: the edges are not stored and cannot be made.
         """
-        pairing, paired_by = pair_views(self.views, self.settings, self.allowed)
-        if check_motion(pairing, paired_by, self.settings) is not None:
-            return None
-        detected = detect_edges_in(
-            self.recording, self.views, pairing, self.settings, out=self.detected_out
+        votes = gather_votes(
+            self.recording, self.views, self.settings, self.allowed, out=self.detected_out, jobs=1
         )
-        edges = known_to(self.seen_by, detected.edges)
-        return edges, inverse_transform(self.seen_by.hand_from_camera)
+        return None if isinstance(votes, TipEstimate) else votes
 
 
 def voted_shape(voters: Voters, estimated: Estimated, out: Path) -> VotedShape | None:
@@ -75,12 +67,12 @@ def voted_shape(voters: Voters, estimated: Estimated, out: Path) -> VotedShape |
     stored = _stored(place, key)
     if stored is not None:
         return stored
-    voted = voters.edges()
-    if voted is None:
+    votes = voters.votes()
+    if votes is None:
         return None
-    edges, camera_from_hand = voted
+    edges = votes.known_to(voters.seen_by)
     frames = edges.frames[:: max(1, len(edges.frames) // _FRAMES)]
-    some = hand_edges(voters.seen_by, edges.of_frames(frames), camera_from_hand, voters.settings)
+    some = votes.seen_by(voters.seen_by, voters.settings, edges.of_frames(frames))
     cloud = reconstruct(some, voters.settings.voting)
     least = max(2, round(_LEAST * len(frames)))
     points, seen = agreed_points(cloud.points, cloud.frames, _VOXEL, least)

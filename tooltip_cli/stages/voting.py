@@ -50,19 +50,24 @@ class Votes:
     detected: DetectedEdges
     spheres: Array  # (S, 4) centre and radius of hand and wrist, metres
 
-    def seen_by(self, views: Views, settings: VotingSettings) -> HandEdges:
+    def known_to(self, views: Views) -> MovingEdges:
+        """Return the edges of frames whose pose is known: by other clocks joints may be missing."""
+        edges = self.detected.edges
+        known = views.known[edges.frames]
+        return edges if known.all() else edges.of_frames(edges.frames[known])
+
+    def seen_by(
+        self, views: Views, settings: VotingSettings, edges: MovingEdges | None = None
+    ) -> HandEdges:
         """Return the edges as a rig sees them, be it the one that they were paired by or a better.
 
         They take a tenth of a gigabyte, so they are made where they are needed.
+
+        Args:
+            edges: some of those that are known to the views; default: all.
         """
         poses = inverse_transform(views.hand_from_camera)
-        return hand_edges(views, known_to(views, self.detected.edges), poses, settings)
-
-
-def known_to(views: Views, edges: MovingEdges) -> MovingEdges:
-    """Return the edges of frames whose pose is known: by other clocks joints may be missing."""
-    known = views.known[edges.frames]
-    return edges if known.all() else edges.of_frames(edges.frames[known])
+        return hand_edges(views, self.known_to(views) if edges is None else edges, poses, settings)
 
 
 def gather_votes(

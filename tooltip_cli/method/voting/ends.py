@@ -42,9 +42,9 @@ class FoundEnd:
 
     candidate: Candidate
     agreement: float  # share of what the images show of it that fits; 0: too few images do
+    radius: float  # metres, roughly
     by_grip: bool = False  # whether only its distance from the grip makes it an end
     by_outlines: bool = False  # whether silhouettes say where it is, rather than moving edges
-    radius: float = 0.0  # metres, roughly
 
 
 @dataclass(frozen=True)
@@ -282,8 +282,8 @@ def _by_outlines(
     refined = resampled(fit, settings.refine, settings.trust.seed)
     covariance = refined.position_covariance + doubt * np.eye(3)
     refined = replace(refined, position_covariance=covariance)
-    end = _refined(refined, fit.support(settings.refine), settings)
-    return replace(end, by_outlines=True, radius=fit.radius)
+    end = _refined(refined, fit.radius, fit.support(settings.refine), settings)
+    return replace(end, by_outlines=True)
 
 
 def _by_edges(
@@ -301,16 +301,16 @@ def _by_edges(
     if refined is None:
         covariance = _voted_covariance(cloud, end, far, spheres, edges.reach, settings)
         candidate = Candidate(end.position, end.support, covariance, end.axis)
-        return FoundEnd(candidate, 0.0, radius=end.radius)
-    return replace(_refined(refined, end.support, settings), radius=end.radius)
+        return FoundEnd(candidate, 0.0, end.radius)
+    return _refined(refined, end.radius, end.support, settings)
 
 
-def _refined(end: RefinedEnd, support: float, settings: VotingSettings) -> FoundEnd:
+def _refined(end: RefinedEnd, radius: float, support: float, settings: VotingSettings) -> FoundEnd:
     covariance, axis_variance = _uncertainty(end, settings.trust)
     candidate = Candidate(
         end.position, support, covariance, end.axis, axis_variance**0.5, end.agreement
     )
-    return FoundEnd(candidate, end.agreement)
+    return FoundEnd(candidate, end.agreement, radius)
 
 
 def _uncertainty(end: RefinedEnd, trust: TrustParams) -> tuple[Array, float]:
