@@ -366,7 +366,7 @@ def test_a_neighbour_is_flashed_and_cannot_be_labelled(hand: Hand, served: Serve
     badge.wait_for()
     hand.page.locator("#badge", has_text="Loading").wait_for(state="hidden")
     assert hand.page.evaluate(canvas) != before
-    hand.click(*hand.fitted((50, 50), SIZE))
+    hand.page.mouse.click(*hand.fitted((50, 50), SIZE))
     hand.page.keyboard.up("s")
     assert hand.page.evaluate(canvas) == before
     assert served.rows == {}
@@ -432,8 +432,10 @@ def test_a_click_before_the_image_is_here_is_no_label(browser: Any, served: Serv
         hand = Hand(page).open(served.url)
         page.get_by_role("button", name="Frame 10, image 9: not labelled").click()
         assert page.locator("#badge").inner_text() == "Loading …"
-        hand.click(*hand.fitted((50, 50), SIZE))
+        page.mouse.click(*hand.fitted((50, 50), SIZE))
         assert page.locator("#message").inner_text() == "The image is not here yet."
+        while not held:  # images before it come first
+            page.wait_for_timeout(10)
         for route in held:
             route.continue_()
         hand.image_is_here()
@@ -451,7 +453,7 @@ def test_an_image_that_cannot_be_decoded_is_said(browser: Any, tmp_path: Path) -
         hand = Hand(page).open(served.url)
         hand.key("f")
         page.locator("#badge", has_text="Image 1 cannot be shown").wait_for()
-        hand.click(*hand.fitted((50, 50), SIZE))
+        page.mouse.click(*hand.fitted((50, 50), SIZE))
         hand.key("f")
         hand.image_is_here()
         assert served.rows == {}

@@ -24,6 +24,7 @@ from tooltip_cli.stages.label import Labeler, Selection, open_session
 
 ALL = Selection(frames=0)
 ANA = Labeler("ana")
+PLACING = re.compile("Arrow|^Enter$|^r$")  # without the image the page does not place a point
 
 
 @dataclass(frozen=True)
@@ -126,13 +127,16 @@ class Hand:
         self.page.locator("#saved", has_text=re.compile("^Saved$")).wait_for()
 
     def key(self, *names: str) -> None:
-        """Press keys one after the other."""
+        """Press keys one after the other; those that place a point once the image is here."""
         for name in names:
+            if PLACING.search(name):
+                self.image_is_here()
             self.actions += 1
             self.page.keyboard.press(name)
 
     def click(self, x: float, y: float) -> None:
-        """Click at a place of the page."""
+        """Click at a place of the page once the image is here."""
+        self.image_is_here()
         self.actions += 1
         self.page.mouse.click(x, y)
 
