@@ -1,6 +1,6 @@
 """Clock offset and a small correction of the camera's pose, from the same edges as the tip.
 
-The equations of :mod:`refine` gain unknowns that recordings of one robot share: the offset tau
+The equations of :mod:`equations` gain unknowns that recordings of one robot share: the offset tau
 between the image and joint clocks, and a rotation r and translation t of the camera. A point X of
 the tool moves in the camera by dP = (dT/dtau X) tau + r x P + t. What belongs to one recording
 alone (its tip, axis and outlines) is eliminated (Schur complement), the rest is added up.
@@ -17,8 +17,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tooltip_cli.method.types import Array, Correction, Refinement
+from tooltip_cli.method.voting.equations import residuals_of, robust_weights
 from tooltip_cli.method.voting.params import CalibrationParams, RefineParams
-from tooltip_cli.method.voting.refine import Fit, best_fit, fit_end, residuals_of, robust_weights
+from tooltip_cli.method.voting.refine import Fit, best_fit, fit_end
 from tooltip_cli.method.voting.sight import NearEdges
 
 PosesAt = Callable[[float], Array]

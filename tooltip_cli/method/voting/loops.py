@@ -1,7 +1,7 @@
 """The loops of the voting method: machine code, or plain numpy where there is none.
 
-The plain forms take the arguments of those in `_voting_numba`, arrays in their own shapes, and fill
-the same ones. They form the same sums in the same order.
+The plain forms take the arguments of those in `_voting_numba` and `_ends_numba`, arrays in their
+own shapes, and fill the same ones. They form the same sums in the same order.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from tooltip_cli.method.voting.silhouette import BACKGROUND, FOREGROUND, Image
 Floats32 = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int32]
 
-_KERNELS = "tooltip_cli.method._voting_numba"
 _NEAR = 0.02  # metres; nothing closer to the optical centre is seen
 _EDGES_AT_ONCE = 4096  # bounds the temporaries to a few megabytes
 
 
 def run(name: str, signature: str, *arguments: object) -> int:
-    """Run one of the loops of `_voting_numba`, by its name, and return what it returns."""
+    """Run one of the loops by its name, and return what it returns."""
+    module, plain = _LOOPS[name]
     return machine_code.fast_or_slow(
-        lambda: machine_code.kernel(_KERNELS, name, signature)(*arguments),
-        lambda: _PLAIN[name](*arguments),
+        lambda: machine_code.kernel(module, name, signature)(*arguments),
+        lambda: plain(*arguments),
         None,
     )
 
@@ -245,10 +245,56 @@ def _choose(
     return found
 
 
-_PLAIN: dict[str, Callable[..., int]] = {
-    "profiler": _profile,
-    "voter": _vote,
-    "placer": _place,
-    "carver": _carve,
-    "chooser": _choose,
+def _measure(
+    rows: Indices,
+    along: Array,
+    across: Array,
+    lengthwise: Array,
+    count: int,
+    sine: Array,
+    frames: int,
+    limits: Array,
+    _slabs: int,
+    end_width: float,
+    min_sine: float,
+    min_edges: int,
+    quantile: float,
+    _values: Array,
+    stops: Array,
+    middles: Array,
+    halves: Array,
+) -> int:
+    rows, along, across = rows[:count], along[:count], across[:count]
+    lengthwise = lengthwise[:count]
+    at_end = np.abs(across) < end_width
+    ranked, starts, counts = _ranked(rows[at_end], along[at_end], frames)
+    enough = counts >= min_edges
+    stops[enough] = ranked[starts[enough] + counts[enough] - 1]
+    for index, (low, high) in enumerate(limits):
+        inside = (lengthwise > low) & (lengthwise < high)
+        if index == 0:
+            inside &= at_end & (sine[rows] > min_sine)
+        ranked, starts, counts = _ranked(rows[inside], across[inside], frames)
+        enough = counts >= min_edges
+        starts, last = starts[enough], counts[enough] - 1
+        skipped = np.round(quantile * last).astype(np.intp)
+        left, right = ranked[starts + skipped], ranked[starts + last - skipped]
+        middles[enough, index], halves[enough, index] = (left + right) / 2, (right - left) / 2
+    return 0
+
+
+def _ranked(rows: Indices, values: Array, frames: int) -> tuple[Array, Indices, Indices]:
+    """Return values sorted within each frame, (F,) where each frame starts, and (F,) counts."""
+    counts = np.bincount(rows, minlength=frames)
+    return values[np.lexsort((values, rows))], np.cumsum(counts) - counts, counts
+
+
+_VOTING, _ENDS = "tooltip_cli.method._voting_numba", "tooltip_cli.method._ends_numba"
+_LOOPS: dict[str, tuple[str, Callable[..., int]]] = {
+    "profiler": (_VOTING, _profile),
+    "voter": (_VOTING, _vote),
+    "placer": (_VOTING, _place),
+    "carver": (_VOTING, _carve),
+    "chooser": (_ENDS, _choose),
+    "measurer": (_ENDS, _measure),
 }

@@ -21,6 +21,7 @@ _CHOOSER = (
     "f64* i64* f32* f64* f64* i64 i64 f64* f64* f64* f64* f64* f64* "
     "f64 f64 f64 f64 f64 i64* f64* f64* f64*"
 )
+_MEASURER = "i64* f64* f64* f64* i64 f64* i64 f64* i64 f64 f64 i64 f64 f64* f64* f64* f64*"
 _FARTHEST = 3  # edges of a frame, whose median is its farthest one
 
 
@@ -29,7 +30,7 @@ class NearEdges:
     """Edges about an end that may belong to the tool."""
 
     pixels: Array  # (E, 2) ideal pixels about the optical centre
-    rows: Indices  # (E,) row of the chosen frames
+    rows: Indices  # (E,) row of the chosen frames, ascending
     profiles: npt.NDArray[np.float32]  # (E, depths) log-likelihood ratios over depth; 0 depths: all
     first: Array  # (E,) depth of a profile's first sample, metres
     step: Array  # (E,) between its samples, metres
@@ -162,22 +163,29 @@ def measure(
     """
     rows, along, across, lengthwise = _on_tool(near, sight, width, params)
     frames = len(sight.scale)
-    at_end = np.abs(across) < end_width
-    ranked, starts, counts = _ranked(rows[at_end], along[at_end], frames)
     stops = np.full(frames, np.nan)
-    enough = counts >= params.min_edges
-    stops[enough] = ranked[starts[enough] + counts[enough] - 1]
     middles, halves = np.full((2, frames, len(slabs)), np.nan)
-    for index, (low, high) in enumerate(slabs):
-        inside = (lengthwise > low) & (lengthwise < high)
-        if index == 0:
-            inside &= at_end & (sight.sine[rows] > params.min_sine_at_end)
-        ranked, starts, counts = _ranked(rows[inside], across[inside], frames)
-        enough = counts >= params.min_edges
-        starts, last = starts[enough], counts[enough] - 1
-        skipped = np.round(params.side_quantile * last).astype(np.intp)
-        left, right = ranked[starts + skipped], ranked[starts + last - skipped]
-        middles[enough, index], halves[enough, index] = (left + right) / 2, (right - left) / 2
+    run(
+        "measurer",
+        _MEASURER,
+        rows,
+        along,
+        across,
+        lengthwise,
+        len(rows),
+        sight.sine,
+        frames,
+        slabs,
+        len(slabs),
+        end_width,
+        params.min_sine_at_end,
+        params.min_edges,
+        params.side_quantile,
+        np.empty(len(rows)),
+        stops,
+        middles,
+        halves,
+    )
     return Measured(stops, middles, halves)
 
 
@@ -203,15 +211,11 @@ def point_of(
     pixels = near.scale_at(position)
     tolerance = max(params.point_tolerance, params.point_tolerance_px / pixels)
     starts = np.arange(-width, width + tolerance, 1.5 * tolerance)
-    best_share, best_step = 0.0, np.zeros(2)
-    for start in np.stack(np.meshgrid(starts, starts), axis=-1).reshape(-1, 2):
-        step = _meeting_point(farthest, directions, start, tolerance)
-        share = float(np.mean(np.abs(farthest - directions @ step) < tolerance))
-        if share > best_share + 1e-9:
-            best_share, best_step = share, step
-    if best_share < params.point_share:
-        return None
-    return np.asarray(basis @ best_step)
+    grid = np.stack(np.meshgrid(starts, starts), axis=-1).reshape(-1, 2)
+    steps = _meeting_points(farthest, directions, grid, tolerance)
+    shares = np.mean(np.abs(farthest - steps @ directions.T) < tolerance, axis=1)
+    best = int(np.argmax(shares))
+    return None if shares[best] < params.point_share else np.asarray(basis @ steps[best])
 
 
 def across_axis(axis: Array) -> Array:
@@ -220,14 +224,18 @@ def across_axis(axis: Array) -> Array:
     return basis
 
 
-def _meeting_point(offsets: Array, directions: Array, start: Array, tolerance: float) -> Array:
-    """Solve ``directions @ step = offsets`` robustly, from one start (2,) on."""
-    step = start
+def _meeting_points(offsets: Array, directions: Array, starts: Array, tolerance: float) -> Array:
+    """Solve ``directions @ step = offsets`` robustly, from each of (K, 2) starts on."""
+    steps = starts
+    x, y = directions.T
+    squares = np.stack([x * x, x * y, x * y, y * y], axis=1)
     for scale in (2.0, 1.5, 1.0, 0.75, 0.75):
-        residuals = offsets - directions @ step
-        weighted = directions / (1.0 + np.square(residuals / (scale * tolerance)))[:, None]
-        step = np.linalg.solve(weighted.T @ directions + 1e-6 * np.eye(2), weighted.T @ offsets)
-    return step
+        residuals = offsets - steps @ directions.T
+        weights = 1.0 / (1.0 + np.square(residuals / (scale * tolerance)))
+        normal = (weights @ squares).reshape(-1, 2, 2) + 1e-6 * np.eye(2)
+        right = (weights * offsets) @ directions
+        steps = np.linalg.solve(normal, right[..., None])[..., 0]
+    return steps
 
 
 def _on_tool(
@@ -271,16 +279,3 @@ def _on_tool(
 
 def _left_of(along: Array) -> Array:
     return np.stack([-along[:, 1], along[:, 0]], axis=1)
-
-
-def _ranked(rows: Indices, values: Array, frames: int) -> tuple[Array, Indices, Indices]:
-    """Return values sorted within each frame, (F,) where each frame starts, and (F,) counts.
-
-    Args:
-        values: metres, all far below one.
-    """
-    # one sort of single numbers takes a fifth of the time of a sort by two keys
-    keys = np.sort(10.0 * rows + values)
-    counts = np.bincount(rows, minlength=frames)
-    starts = np.cumsum(counts) - counts
-    return keys - 10.0 * np.repeat(np.arange(frames), counts), starts, counts

@@ -85,7 +85,7 @@ class HandSilhouettes:
     masks: Image  # (F, h, w)
     view: Array  # (3, 3) from normalized coordinates to a mask's pixels
     points: Array  # (K, 2) normalized coordinates x/z, y/z of the outlines' points
-    rows: Indices  # (K,) silhouette that each belongs to
+    rows: Indices  # (K,) silhouette that each belongs to, ascending
     focal_px: float  # ideal pixels of an image per unit of normalized coordinates
 
 

@@ -60,7 +60,7 @@ class Cloud:
     score: float  # best share of expected frames that any coarse voxel was seen in
     consistent: float  # share of the moving edges that belong to something fixed to the hand
     edges: Array  # (K, 2) normalized coordinates of all edges that may be fixed to the hand
-    edge_rows: Indices  # (K,) row of the chosen frames
+    edge_rows: Indices  # (K,) row of the chosen frames, ascending
     profiles: npt.NDArray[np.float32]  # (K, depths) their log-likelihood ratios over depth
     depths: Array  # (F, 3) first depth and step of each frame's profiles, metres; focal length
 
