@@ -315,16 +315,32 @@ def test_it_is_said_when_the_images_agree_little() -> None:
 def test_an_end_is_in_doubt_where_the_images_disagree() -> None:
     assert estimate_or_doubt(view(TIP), SPHERES, SETTINGS)[1] is None
     demanding = replace(SETTINGS, trust=replace(SETTINGS.trust, full_agreement=1.01))
-    found, part = estimate_or_doubt(view(TIP), SPHERES, demanding)
-    assert part is not None
+    found, doubt = estimate_or_doubt(view(TIP), SPHERES, demanding)
+    assert doubt is not None
     assert found.position is not None
+    part = doubt.part
     np.testing.assert_array_equal(part.position, found.position)
     np.testing.assert_array_equal(part.axis, found.candidates[0].axis)
     assert part.radius > 0
     only_hand = np.array([[0.0, 0.0, 0.0, 0.2]])
-    refusal, part = estimate_or_doubt(view(TIP / 4), only_hand, demanding)
+    refusal, nothing = estimate_or_doubt(view(TIP / 4), only_hand, demanding)
     assert refusal.position is None
-    assert part is None
+    assert nothing is None
+
+
+def test_a_cloud_by_poses_that_are_nearly_right_will_do() -> None:
+    demanding = replace(SETTINGS, trust=replace(SETTINGS.trust, full_agreement=1.01))
+    edges = view(TIP)
+    shifted = edges.camera_from_hand.copy()
+    shifted[:, 0, 3] += 0.005
+    first, doubt = estimate_or_doubt(replace(edges, camera_from_hand=shifted), SPHERES, demanding)
+    assert doubt is not None
+    right, again = (estimate_by_voting(edges, SPHERES, SETTINGS, by) for by in (None, doubt.cloud))
+    assert first.position is not None
+    assert right.position is not None
+    assert again.position is not None
+    assert np.linalg.norm(again.position - right.position) < 5e-4
+    assert np.linalg.norm(first.position - right.position) > 2e-3
 
 
 def test_it_is_said_when_the_end_is_uncertain() -> None:

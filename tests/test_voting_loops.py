@@ -41,6 +41,9 @@ def test_an_estimate_without_a_compiler_is_the_same_and_says_so_once(
     no_compiler.undo()
     compiled = estimate_by_voting(view(TIP), SPHERES, SETTINGS)
     assert plain.position is not None
+    assert compiled.position is not None
+    assert plain.covariance is not None
+    assert compiled.covariance is not None
     # but for the order of the sums in the normal equations
     np.testing.assert_allclose(plain.position, compiled.position, rtol=0, atol=1e-9)
     np.testing.assert_allclose(plain.covariance, compiled.covariance, rtol=1e-6, atol=1e-12)

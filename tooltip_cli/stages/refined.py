@@ -17,6 +17,7 @@ from tooltip_cli.method.voting.calibrate import calibrate
 from tooltip_cli.method.voting.ends import ClosePart, first_end
 from tooltip_cli.method.voting.estimate import estimate_by_voting, estimate_or_doubt, less_sure
 from tooltip_cli.method.voting.params import PUT_RIGHT, VotingSettings
+from tooltip_cli.method.voting.volume import Cloud, HandEdges
 from tooltip_cli.rig.rigfile import Rig
 from tooltip_cli.stages.calibrate import rig_of, seen_part
 from tooltip_cli.stages.memory import give_back_freed
@@ -79,15 +80,19 @@ class _Ballot:
         Nobody has said that the rig may be wrong: nothing is made of it where that does not help.
         """
         seen = self.votes.seen_by(self.views, self.settings)
-        estimate, part = estimate_or_doubt(seen, self.votes.spheres, self.settings)
-        del seen
-        if part is None or self.settings.put_right == "none":
+        estimate, doubt = estimate_or_doubt(seen, self.votes.spheres, self.settings)
+        if doubt is None or self.settings.put_right == "none":
             return estimate
-        found, views = self.look_at(part, camera=True)
+        found, views = self.look_at(doubt.part, camera=True)
         if found is None:
             return estimate
         if found.applied:
-            better = self.estimate(views, found)
+            moved = self.votes.moved(seen, views)
+            if moved is None:
+                del seen, doubt
+                better = self.estimate(views, found)
+            else:  # where edges lie in the hand frame changes by millimetres
+                better = self.conclude(moved, found, doubt.cloud)
             if gain(estimate, better) > self.settings.calibration.agreement_gain:
                 return better
         return replace(estimate, refinement=replace(found, applied=False))
@@ -107,8 +112,13 @@ class _Ballot:
     def estimate(self, views: Views, found: Refinement | None) -> TipEstimate:
         """Estimate by some views, and add what was found and what that leaves unknown."""
         give_back_freed()
-        seen = self.votes.seen_by(views, self.settings)
-        estimate = estimate_by_voting(seen, self.votes.spheres, self.settings)
+        return self.conclude(self.votes.seen_by(views, self.settings), found)
+
+    def conclude(
+        self, seen: HandEdges, found: Refinement | None, cloud: Cloud | None = None
+    ) -> TipEstimate:
+        """Estimate from edges, and add what was found of the rig."""
+        estimate = estimate_by_voting(seen, self.votes.spheres, self.settings, cloud)
         if found is None:
             return estimate
         (tip_covariance,) = found.tip_covariances

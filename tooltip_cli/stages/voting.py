@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +68,19 @@ class Votes:
         """
         poses = inverse_transform(views.hand_from_camera)
         return hand_edges(views, self.known_to(views) if edges is None else edges, poses, settings)
+
+    def moved(self, seen: HandEdges, views: Views) -> HandEdges | None:
+        """Return edges that were seen by one rig as another sees them, without undistorting again.
+
+        None: one of the rigs knows the poses of fewer images.
+        """
+        frames = seen.moving.frames
+        known = int(views.known[self.detected.edges.frames].sum())
+        if len(frames) < known or not views.known[frames].all():
+            return None
+        poses = inverse_transform(views.hand_from_camera)
+        outlines = _hand_silhouettes(views.camera, seen.moving, poses)
+        return replace(seen, camera_from_hand=poses, silhouettes=outlines)
 
 
 def gather_votes(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -65,25 +65,33 @@ def view_spread_deg(camera_from_hand: Array) -> float:
     return float(np.degrees(angular_spread(seen_from / lengths)))
 
 
-def estimate_by_voting(edges: HandEdges, spheres: Array, settings: VotingSettings) -> TipEstimate:
+@dataclass(frozen=True)
+class Doubt:
+    """What an estimate was made from, about whose end the images disagree."""
+
+    cloud: Cloud
+    part: ClosePart  # the end, and what is seen about it
+
+
+def estimate_by_voting(
+    edges: HandEdges, spheres: Array, settings: VotingSettings, cloud: Cloud | None = None
+) -> TipEstimate:
     """Find the tool's far end among all edges that move with the hand.
 
     Args:
         spheres: (S, 4) centre and radius of hand and wrist, metres.
+        cloud: of the same edges, by poses that are nearly these; None: it is made by these.
     """
-    return estimate_or_doubt(edges, spheres, settings)[0]
+    return estimate_or_doubt(edges, spheres, settings, cloud)[0]
 
 
 def estimate_or_doubt(
-    edges: HandEdges, spheres: Array, settings: VotingSettings
-) -> tuple[TipEstimate, ClosePart | None]:
-    """Estimate, and return the end with what is seen about it where the images disagree.
-
-    Args:
-        spheres: (S, 4) centre and radius of hand and wrist, metres.
+    edges: HandEdges, spheres: Array, settings: VotingSettings, cloud: Cloud | None = None
+) -> tuple[TipEstimate, Doubt | None]:
+    """Do the same, and return what the estimate was made from where the images disagree.
 
     Returns:
-        the estimate, and the end; None: the images agree, or the estimate is refused.
+        the estimate, and the doubt; None: the images agree, or the estimate is refused.
     """
     # here, as whoever only looks whether the motion will do has no use for them
     from tooltip_cli.method.voting.end import tool_shape
@@ -91,7 +99,8 @@ def estimate_or_doubt(
     from tooltip_cli.method.voting.volume import reconstruct
 
     used = len(edges.moving.frames)
-    cloud = reconstruct(edges, settings.voting)
+    if cloud is None:
+        cloud = reconstruct(edges, settings.voting)
     shape = tool_shape(cloud, spheres, edges.reach, settings.end)
     trust = settings.trust
     halved = _halved(edges, settings.pairing)
@@ -124,7 +133,8 @@ def estimate_or_doubt(
     )
     if agreement >= trust.full_agreement:
         return found_tip, None
-    return found_tip, close_part(edges, cloud, end, settings.refine)
+    part = close_part(edges, cloud, end, settings.refine)
+    return found_tip, None if part is None else Doubt(cloud, part)
 
 
 def less_sure(estimate: TipEstimate, covariance: Array, trust: TrustParams) -> TipEstimate:

@@ -19,6 +19,7 @@ Floats32 = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int32]
 
 _NEAR = 0.02  # metres; nothing closer to the optical centre is seen
+_LEAST_SCORE = 1e-3  # of the volume: less says nothing
 _EDGES_AT_ONCE = 4096  # bounds the temporaries to a few megabytes
 
 
@@ -138,6 +139,7 @@ def _place(
     step: float,
     weight: float,
     substeps: int,
+    _blocks: Image,
     positions: Array,
     scores: Array,
 ) -> int:
@@ -166,10 +168,11 @@ def _place(
             for corner_ in (0, n, n * n, n * n + n)
         )
         score = (v00 * (1 - b) + v01 * b) * (1 - a) + (v10 * (1 - b) + v11 * b) * a
-        total = weight * np.log(np.maximum(score, 1e-3)) + ratio[edge]
+        total = weight * np.log(np.maximum(score, _LEAST_SCORE)) + ratio[edge]
         better = total > best[edge]
-        edge = edge[better]
-        best[edge], scores[edge], positions[edge] = total[better], score[better], there[edge]
+        edge, score = edge[better], score[better]
+        best[edge], positions[edge] = total[better], there[edge]
+        scores[edge] = np.where(score > _LEAST_SCORE, score, 0.0)
     return 0
 
 

@@ -19,6 +19,7 @@ _LEAST_MOTION_PX = 1.5  # a voxel that moves less is not expected to show
 _FULL_RATIO = 3.0  # a log-likelihood ratio of this and above counts as one whole vote
 _FEWEST_EXPECTED = 20.0  # frames; keeps voxels that few frames could show from scoring high
 _VOTING_FRAMES = 100  # of the chosen ones take part in the first vote; more change little
+_BLOCK = 8  # voxels, as in _voting_numba.py
 _KEEP_RATIO = 1.0  # edges that never reach this are neither hand nor tool
 _CELL_PX = 2.0  # pixels a side of the cells in which the edge nearest to a voxel is looked up
 _SMEAR = 1  # cells around an edge within which a voxel counts as near it
@@ -30,7 +31,7 @@ _VOTER = (
     "f64* i64 f64 f64* f64* i64 f64 f64 f64 i64 i64 i32* f32* i64 f64* f64 f64 "
     "f64* i64* f64* f32* f32*"
 )
-_PLACER = "f64* i64* f32* i64 i64 f64* f64* f32* i64 f64 f64 f64 i64 f64* f64*"
+_PLACER = "f64* i64* f32* i64 i64 f64* f64* f32* i64 f64 f64 f64 i64 u8* f64* f64*"
 
 
 @dataclass(frozen=True)
@@ -239,6 +240,7 @@ def _place(
         step,
         params.volume_weight,
         substeps,
+        np.zeros((len(volume) // _BLOCK + 1,) * 3, np.uint8),
         positions,
         scores,
     )
