@@ -92,7 +92,9 @@ def samples(depths: Array) -> Array:
 def profiles_of(edges: HandEdges) -> tuple[Array, npt.NDArray[np.float32]]:
     depths = volume._depth_ranges(edges, SMALL)
     rows = edges.moving.frame_of_edge
-    return depths, volume._depth_profiles(edges, rows, depths, SMALL)
+    kept, profiles = volume._depth_profiles(edges, rows, depths, SMALL, -np.inf)
+    assert kept.all()
+    return depths, profiles
 
 
 def test_depths_cover_the_reach(small: HandEdges) -> None:
@@ -112,6 +114,18 @@ def test_depth_profiles_are_the_likelihood_ratios(small: HandEdges) -> None:
     np.testing.assert_allclose(profiles[some], expected, atol=2e-4)
     assert profiles.max() > 2  # and is not everywhere the same
     assert profiles.min() < -2
+
+
+def test_only_edges_that_may_be_fixed_to_the_hand_are_held(
+    small: HandEdges, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    depths, profiles = profiles_of(small)
+    likely = profiles.max(axis=1) > volume._KEEP_RATIO
+    assert 0 < likely.sum() < len(likely)
+    monkeypatch.setattr(volume, "_EDGES_AT_ONCE", 10)
+    kept, held = volume._depth_profiles(small, small.moving.frame_of_edge, depths, SMALL)
+    np.testing.assert_array_equal(kept, likely)
+    np.testing.assert_array_equal(held, profiles[likely])
 
 
 def longhand_vote(
@@ -203,7 +217,7 @@ def test_every_cell_knows_its_nearest_edge(small: HandEdges) -> None:
     rng = np.random.default_rng(3)
     crowded = rng.uniform(-0.05, 0.05, (240, 2))
     rows = small.moving.frame_of_edge
-    raster, nearest = volume._nearest_edges(small, crowded, rows, len(small.moving.frames))
+    raster, nearest = volume._nearest_edges(small, crowded, rows, 1)
     cells = np.round(raster[0] * crowded - raster[1:]).astype(int)
     for row, v, u in np.argwhere(nearest >= 0)[::7]:
         mine = np.abs(cells[rows == row] - (u, v))

@@ -32,12 +32,13 @@ def visual_hull(
         reach: metres from the hand's origin.
     """
     camera, view = silhouettes.camera_from_hand, silhouettes.view
-    masks = _where_the_hand_hides(silhouettes.masks, camera, view, spheres, params)
+    masks = silhouettes.masks
+    hidden = _where_the_hand_hides(masks, camera, view, spheres, params)
     cameras = np.ascontiguousarray(view @ camera[:, :3])
     voxels = _ball(reach, params.coarse)
-    kept, _ = _uncarved(voxels, cameras, masks, params.coarse, params)
+    kept, _ = _uncarved(voxels, cameras, masks, hidden, params.coarse, params)
     voxels = (voxels[kept][:, None] + params.coarse * _CHILDREN).reshape(-1, 3)
-    kept, frames = _uncarved(voxels, cameras, masks, params.fine, params)
+    kept, frames = _uncarved(voxels, cameras, masks, hidden, params.fine, params)
     return _pieces(voxels[kept], frames[kept], spheres, params.fine)
 
 
@@ -59,9 +60,11 @@ def missing(silhouettes: HandSilhouettes, points: Array) -> Array:
 
 def _where_the_hand_hides(
     masks: Image, camera_from_hand: Array, view: Array, spheres: Array, params: HullParams
-) -> Image:
-    """Forget pixels that the hand stands before most of the time: the background learnt there may
-    be the hand."""
+) -> npt.NDArray[np.bool_]:
+    """Return (H, W) pixels that the hand stands before most of the time.
+
+    The background learnt there may be the hand.
+    """
     import cv2
 
     covered = np.zeros(masks.shape[1:], dtype=np.float32)
@@ -75,12 +78,16 @@ def _where_the_hand_hides(
                 if abs(u) < 1e4 and abs(v) < 1e4:
                     cv2.circle(hand, (round(u), round(v)), round(size), 1, -1)
         covered += hand
-    hidden = covered > params.max_cover * len(camera_from_hand)
-    return np.where(hidden, np.uint8(UNKNOWN), masks) if hidden.any() else masks
+    return np.asarray(covered > params.max_cover * len(camera_from_hand))
 
 
 def _uncarved(
-    voxels: Array, cameras: Array, masks: Image, size: float, params: HullParams
+    voxels: Array,
+    cameras: Array,
+    masks: Image,
+    hidden: npt.NDArray[np.bool_],
+    size: float,
+    params: HullParams,
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int32]]:
     """Return (V,) which voxels stay, and (V,) how many silhouettes each lies in."""
     import cv2
@@ -91,7 +98,8 @@ def _uncarved(
     side = 2 * max(1, round(params.margin * pixels)) + 1
     square = np.ones((side, side), np.uint8)
     wide = np.empty_like(masks)
-    for mask, wider in zip(masks, wide, strict=True):
+    for whole, wider in zip(masks, wide, strict=True):
+        mask = np.where(hidden, np.uint8(UNKNOWN), whole)
         np.maximum(mask, cv2.dilate((mask == FOREGROUND) * mask, square), out=wider)
     order = np.random.default_rng(0).permutation(len(wide))  # unlike views carve soonest
     limit = int(params.max_missing * len(wide))

@@ -19,6 +19,7 @@ _LEAST_MOTION_PX = 1.5  # a voxel that moves less is not expected to show
 _FULL_RATIO = 3.0  # a log-likelihood ratio of this and above counts as one whole vote
 _FEWEST_EXPECTED = 20.0  # frames; keeps voxels that few frames could show from scoring high
 _VOTING_FRAMES = 100  # of the chosen ones take part in the first vote; more change little
+_EDGES_AT_ONCE = 1 << 15  # whose profiles are 8 MB
 _BLOCK = 8  # voxels, as in _voting_numba.py
 _KEEP_RATIO = 1.0  # edges that never reach this are neither hand nor tool
 _CELL_PX = 2.0  # pixels a side of the cells in which the edge nearest to a voxel is looked up
@@ -77,9 +78,8 @@ def reconstruct(edges: HandEdges, params: VotingParams) -> Cloud:
     moving = edges.moving
     rows = moving.frame_of_edge
     depths = _depth_ranges(edges, params)
-    profiles = _depth_profiles(edges, rows, depths, params)
-    kept = profiles.max(axis=1, initial=0.0) > _KEEP_RATIO
-    points, rows, profiles = edges.points[kept], rows[kept], profiles[kept]
+    kept, profiles = _depth_profiles(edges, rows, depths, params)
+    points, rows = edges.points[kept], rows[kept]
     hits, expected = _vote(edges, points, rows, profiles, depths, params)
     volume = (hits / np.maximum(expected, _FEWEST_EXPECTED)).astype(np.float32)
     score = float(volume.max(initial=0.0))
@@ -123,30 +123,50 @@ def _depth_ranges(edges: HandEdges, params: VotingParams) -> Array:
 
 
 def _depth_profiles(
-    edges: HandEdges, rows: Indices, depths: Array, params: VotingParams
-) -> npt.NDArray[np.float32]:
+    edges: HandEdges,
+    rows: Indices,
+    depths: Array,
+    params: VotingParams,
+    least: float = _KEEP_RATIO,
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.float32]]:
+    """Return (E,) which edges may be fixed to the hand, and their profiles (K, depths).
+
+    The profiles are the largest arrays there are: no others are ever held.
+
+    Args:
+        least: ratio that an edge's profile must exceed somewhere.
+    """
     moving = edges.moving
     camera = edges.camera_from_hand
     hand_from_camera = np.linalg.inv(camera[moving.frames])
-    between = camera[moving.partners] @ hand_from_camera[:, None]
-    profiles = np.zeros((len(rows), params.depths), dtype=np.float32)
-    run(
-        "profiler",
-        _PROFILER,
-        edges.points,
-        np.ascontiguousarray(edges.focal_px * edges.moved),
-        moving.covariances,
-        np.ascontiguousarray(edges.focal_px * edges.background),
-        rows.astype(np.int64),
-        len(rows),
-        np.ascontiguousarray(between),
-        depths,
-        params.depths,
-        params.clip,
-        params.prediction_variance,
-        profiles,
-    )
-    return profiles
+    between = np.ascontiguousarray(camera[moving.partners] @ hand_from_camera[:, None])
+    kept = np.zeros(len(rows), dtype=bool)
+    profiles = np.empty((len(rows), params.depths), dtype=np.float32)  # no memory until written
+    count = 0
+    for start in range(0, len(rows), _EDGES_AT_ONCE):
+        part = slice(start, start + _EDGES_AT_ONCE)
+        some = np.zeros((len(rows[part]), params.depths), dtype=np.float32)
+        run(
+            "profiler",
+            _PROFILER,
+            edges.points[part],
+            np.ascontiguousarray(edges.focal_px * edges.moved[part]),
+            moving.covariances[part],
+            np.ascontiguousarray(edges.focal_px * edges.background[part]),
+            rows[part].astype(np.int64),
+            len(some),
+            between,
+            depths,
+            params.depths,
+            params.clip,
+            params.prediction_variance,
+            some,
+        )
+        kept[part] = some.max(axis=1, initial=-np.inf) > least
+        some = some[kept[part]]
+        profiles[count : count + len(some)] = some
+        count += len(some)
+    return kept, profiles[:count]
 
 
 def _vote(
@@ -161,10 +181,9 @@ def _vote(
     hits = np.zeros((len(axis),) * 3, dtype=np.float32)
     expected = np.zeros_like(hits)
     every = max(1, round(len(edges.moving.frames) / _VOTING_FRAMES))
-    voting = rows % every == 0
     camera = edges.camera_from_hand[:, :3]
     frames, n = edges.moving.frames[::every], len(axis)
-    raster, nearest = _nearest_edges(edges, points[voting], rows[voting] // every, len(frames))
+    raster, nearest = _nearest_edges(edges, points, rows, every)
     run(
         "voter",
         _VOTER,
@@ -177,7 +196,7 @@ def _vote(
         *raster,
         *nearest.shape[1:],
         nearest,
-        np.ascontiguousarray(profiles[voting]),
+        profiles,
         profiles.shape[1],
         np.ascontiguousarray(depths[::every]),
         _LEAST_MOTION_PX / _CELL_PX,
@@ -192,21 +211,27 @@ def _vote(
 
 
 def _nearest_edges(
-    edges: HandEdges, points: Array, rows: Indices, frames: int
+    edges: HandEdges, points: Array, rows: Indices, every: int
 ) -> tuple[Array, npt.NDArray[np.int32]]:
-    """Return the raster (focal, u0, v0) in cells and (F, H, W) each cell's nearest edge, or -1."""
+    """Return the raster (focal, u0, v0) in cells and each cell's nearest edge, or -1.
+
+    The latter is (F, H, W), of one in ``every`` frames.
+    """
     focal = edges.focal_px / _CELL_PX
     low, high = focal * edges.extent
     width, height = (np.ceil(high - low) + 1).astype(int)
+    frames = len(edges.moving.frames[::every])
     nearest = np.full((frames, height, width), -1, dtype=np.int32)
-    columns, lines = np.round(focal * points - low).astype(int).T
+    edge = np.flatnonzero(rows % every == 0)
+    frame = rows[edge] // every
+    columns, lines = np.round(focal * points[edge] - low).astype(int).T
     reach = range(-_SMEAR, _SMEAR + 1)
     offsets = [(du, dv) for du in reach for dv in reach]
     for du, dv in sorted(offsets, key=lambda at: -(at[0] ** 2 + at[1] ** 2)):
         # the nearest are written last
         u, v = columns + du, lines + dv
         inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        nearest[rows[inside], v[inside], u[inside]] = np.flatnonzero(inside)
+        nearest[frame[inside], v[inside], u[inside]] = edge[inside]
     return np.array([focal, *low]), nearest
 
 
@@ -258,8 +283,10 @@ def _recount(
     ndimage.gaussian_filter(counts, 1.0, truncate=3.0, output=counts)  # in place: it is large
     coarse = grid_axis(reach, params.coarse)
     nearest = np.clip(np.round((axis - coarse[0]) / params.coarse), 0, len(coarse) - 1).astype(int)
-    due = np.maximum(expected, _FEWEST_EXPECTED)[np.ix_(nearest, nearest, nearest)]
-    return np.divide(counts, due, out=counts)
+    due = np.maximum(expected, _FEWEST_EXPECTED)
+    for layer, row in zip(counts, nearest, strict=True):  # the whole would be as large as counts
+        layer /= due[row][np.ix_(nearest, nearest)]
+    return counts
 
 
 def frames_per_voxel(positions: Array, rows: Indices, axis: Array) -> Volume:
