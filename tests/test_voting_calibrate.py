@@ -112,14 +112,17 @@ def test_what_stays_unknown_of_the_rig_is_said_of_the_tip(camera: bool, off: boo
     ("supports", "tried", "best"),
     [
         ([(0.3, 0.8)], 1, 0.8),
-        ([(0.6, 0.59)], 1, 0.59),  # nothing to put right
+        ([(0.3, 0.6), (0.2, 0.5)], 2, 0.6),
+        ([(0.3, 0.5), (0.2, 0.6)], 2, 0.6),
+        ([(0.6, 0.59), (0.58, 0.57)], 2, 0.59),  # nothing to put right
         ([(0.3, 0.1), (0.2, 0.6)], 2, 0.6),
         ([(0.3, 0.2), (0.2, 0.1)], 2, 0.2),
         ([(0.6, 0.4), (0.2, 0.45)], 2, 0.45),  # but less than without any correction
+        ([(0.3, 0.5), (0.6, 0.55)], 2, 0.5),  # the other one corrects nothing
         ([None, (0.2, 0.6)], 2, 0.6),
     ],
 )
-def test_what_is_no_solution_is_looked_for_with_wider_ends(
+def test_wider_ends_are_tried_until_enough_fits(
     supports: list[tuple[float, float] | None],
     tried: int,
     best: float,

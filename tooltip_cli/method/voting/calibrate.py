@@ -26,7 +26,6 @@ PosesAt = Callable[[float], Array]
 """Return (F, 4, 4) camera_from_hand of the chosen frames with image stamps shifted, seconds."""
 
 _LOOSE_MOVE = 0.03  # metres that an end may move by while clocks and camera are put right
-_NO_LESS = 0.9  # share of the support without a correction, that a solution has with it
 _RATE_STEP_S = 0.004  # half the interval over which the hand's motion is differenced
 
 
@@ -54,8 +53,8 @@ def calibrate(
 ) -> Refinement | None:
     """Solve for what recordings of one robot share; None: no end can be fitted.
 
-    Where fewer frames fit with what was found than without, it is no solution: it is looked for
-    again with ends that are taken to be wider, and the best is returned.
+    How wide an end is is known roughly before clocks and camera are right. So it is solved for with
+    ends as wide as they seem, and wider, until enough fits; that with which most fits is returned.
 
     Args:
         camera: whether the camera's pose may be corrected besides the clocks' offset. It is where
@@ -71,11 +70,15 @@ def calibrate(
             before = best.support_before
             helps = found.applied and found.support_after > before
             found = replace(found, applied=helps, support_before=before)
-        if best is None or found.support_after > best.support_after:
+        if best is None or _worth(found) > _worth(best):
             best = found
-        if best.support_after > _NO_LESS * best.support_before:
+        if best.support_after > params.enough_support:
             break
     return best
+
+
+def _worth(found: Refinement) -> tuple[bool, float]:
+    return found.applied, found.support_after
 
 
 def _calibrated(

@@ -189,7 +189,8 @@ class CalibrationParams:
     time_prior: float = 0.03  # seconds, standard deviation of the clocks' offset
     rotation_prior_deg: float = 1.0  # of the camera about each axis
     translation_prior: float = 0.005  # metres, of the camera along each axis
-    radius_factors: tuple[float, ...] = (1.0, 2.0)  # of an end's, until there is a solution
+    radius_factors: tuple[float, ...] = (1.0, 2.0)  # of an end's, that are tried
+    enough_support: float = 0.7  # of what the images could show of the end, to try no more
     rounds: int = 10
     settled: float = 0.003  # of those deviations, smallest step worth another round
     certain: float = 3.0  # standard deviations that an offset must have to be used
