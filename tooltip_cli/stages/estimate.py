@@ -49,7 +49,7 @@ from tooltip_cli.stages.near import near_unless
 from tooltip_cli.stages.refined import vote
 
 SUFFIX = ".tip.json"
-VERSION = 9
+VERSION = 10
 _LOGGER = logging.getLogger(__name__)
 
 
