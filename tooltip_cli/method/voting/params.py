@@ -197,7 +197,7 @@ class CalibrationParams:
     camera_gain: float = 0.05  # share of frames that must fit besides, for a camera's correction
     common_error: float = 10.0  # variance of what is wrong in all frames alike, over that of chance
     determined: float = 0.33  # of those deviations, largest that still determines a direction
-    agreement_gain: float = 0.04  # of what images show of the end, that must fit besides, unasked
+    agreement_gain: float = 0.065  # of what images show of the end, that must fit besides, unasked
 
 
 @dataclass(frozen=True)
