@@ -434,8 +434,11 @@ def test_a_click_before_the_image_is_here_is_no_label(browser: Any, served: Serv
         assert page.locator("#badge").inner_text() == "Loading …"
         page.mouse.click(*hand.fitted((50, 50), SIZE))
         assert page.locator("#message").inner_text() == "The image is not here yet."
-        while not held:  # images before it come first
+        for _ in range(1500):
+            if held:  # images before it come first
+                break
             page.wait_for_timeout(10)
+        assert held
         for route in held:
             route.continue_()
         hand.image_is_here()

@@ -28,7 +28,8 @@ from tooltip_cli.method.rays import sphere_array
 from tooltip_cli.method.types import Candidate, TipEstimate, refused
 from tooltip_cli.method.voting.estimate import estimate_by_voting
 from tooltip_cli.method.voting.moving import MovingEdges
-from tooltip_cli.method.voting.params import TrustParams, VotingSettings
+from tooltip_cli.method.voting.params import TrustParams, VotingParams, VotingSettings
+from tooltip_cli.method.voting.volume import Cloud, HandEdges, reconstruct
 from tooltip_cli.report.scoring import project_tip
 from tooltip_cli.rig.kinematics import inverse_transform
 from tooltip_cli.rig.rigfile import load_rig
@@ -38,7 +39,7 @@ from tooltip_cli.stages.held_out import unlabelled
 from tooltip_cli.stages.label import find_hints
 from tooltip_cli.stages.moving import DetectedEdges, known_edges
 from tooltip_cli.stages.refined import gain
-from tooltip_cli.stages.voting import hand_edges, pair_views
+from tooltip_cli.stages.voting import Votes, gather_votes, hand_edges, pair_views
 
 Stamps = npt.NDArray[np.int64]
 
@@ -272,6 +273,19 @@ def test_motion_that_cannot_show_the_tip_is_refused(
     assert f"reused {run.tip_path}" in again.err
 
 
+@pytest.fixture
+def clouds(monkeypatch: pytest.MonkeyPatch) -> list[Cloud]:
+    """What is reconstructed, from here on."""
+    made: list[Cloud] = []
+
+    def kept(edges: HandEdges, params: VotingParams) -> Cloud:
+        made.append(reconstruct(edges, params))
+        return made[-1]
+
+    monkeypatch.setattr("tooltip_cli.method.voting.volume.reconstruct", kept)
+    return made
+
+
 def late_rig(run: Run, folder: Path) -> Path:
     """Write the recording's rig with image stamps that are put 30 ms too late."""
     recording = read_recording(run.recording, Topics())
@@ -295,12 +309,13 @@ def test_a_wrong_clock_is_put_right(run: Run, tmp_path: Path) -> None:
 
 
 def test_a_wrong_clock_is_put_right_unasked_where_the_images_disagree(
-    run: Run, tmp_path: Path
+    run: Run, tmp_path: Path, clouds: list[Cloud]
 ) -> None:
     assert "refined" not in run.document  # the right one: nothing to look for
     late = late_rig(run, tmp_path / "late")
-    done = tooltip("estimate", run.recording, "--rig", late, "--json")
+    done = tooltip("estimate", run.recording, "--rig", late, "--json", "--force")
     assert done.code == 0, done.err
+    assert len(clouds) == 1  # what was voted for is kept
     assert "image clock -" in done.err
     document = json.loads(done.out)
     assert document["refined"]["applied"]
@@ -376,8 +391,38 @@ def estimate_late(recording: Recording, out: Path, put_right: str = "auto") -> T
     return estimate_from_images(recording, rig, views, params, allowed, out=out).estimate
 
 
-def test_images_whose_pose_is_unknown_by_the_right_clock_are_left_out(
+def test_edges_are_seen_by_another_clock_as_if_they_were_undistorted_anew(
     first: Run, tmp_path: Path
+) -> None:
+    recording, settings = read_recording(first.recording, Topics()), VotingSettings()
+    rig = resolve_rig(recording, None)
+    views, later = (
+        resolve_views(recording, replace(rig, time_offset_s=offset)) for offset in (0.0, 0.01)
+    )
+    allowed = np.ones(len(views.stamps_ns), dtype=bool)
+    votes = gather_votes(recording, views, settings, allowed, out=tmp_path, jobs=1)
+    assert isinstance(votes, Votes)
+    seen = votes.seen_by(views, settings)
+    moved, anew = votes.moved(seen, later), votes.seen_by(later, settings)
+    assert moved is not None
+    assert not np.array_equal(moved.camera_from_hand, seen.camera_from_hand)
+    for name in ("points", "moved", "background", "camera_from_hand"):
+        np.testing.assert_array_equal(getattr(moved, name), getattr(anew, name))
+    assert moved.silhouettes is not None
+    assert anew.silhouettes is not None
+    for name in ("camera_from_hand", "masks", "view", "points", "rows"):
+        np.testing.assert_array_equal(
+            getattr(moved.silhouettes, name), getattr(anew.silhouettes, name)
+        )
+    lost = later.hand_from_camera.copy()
+    lost[seen.moving.frames[0]] = np.nan
+    fewer = replace(later, hand_from_camera=lost)
+    assert votes.moved(seen, fewer) is None
+    assert votes.moved(votes.seen_by(fewer, settings), later) is None
+
+
+def test_images_whose_pose_is_unknown_by_the_right_clock_are_left_out(
+    first: Run, tmp_path: Path, clouds: list[Cloud]
 ) -> None:
     whole = read_recording(first.recording, Topics())
     # by the wrong clock image 50 comes just after the gap, by the right one inside it
@@ -390,6 +435,7 @@ def test_images_whose_pose_is_unknown_by_the_right_clock_are_left_out(
                       found.refinement.correction)  # fmt: skip
     known = resolve_views(gap, right).known
     assert not known[50]
+    assert len(clouds) == 2  # of other images
     assert found.position is not None
     off = found.position - truth(first.recording)["tip_in_hand_m"]
     assert np.linalg.norm(off) < 0.004

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +16,7 @@ from tooltip_cli.method.voting.end import (
     locate_far_side,
     locate_hull_end,
 )
-from tooltip_cli.method.voting.hull import missing, visual_hull
+from tooltip_cli.method.voting.hull import _where_the_hand_hides, missing, visual_hull
 from tooltip_cli.method.voting.outline import fit_outlines
 from tooltip_cli.method.voting.params import EndParams, HullParams, OutlineParams, RefineParams
 from tooltip_cli.method.voting.refine import Fit
@@ -136,6 +138,24 @@ def test_the_spheres_are_no_tool() -> None:
     spheres = np.array([[*(TIP - 0.06 * AXIS), 0.045]])
     hull = visual_hull(seen([round_bar()]), spheres, 0.3, HullParams())
     assert (np.linalg.norm(hull.voxels - spheres[0, :3], axis=1) >= 0.045).all()
+
+
+def test_where_the_hand_mostly_stands_the_background_carves_nothing() -> None:
+    poses = poses_of(np.random.default_rng(0).uniform(-0.3, 0.3, (FRAMES, 3)))
+    silhouettes, params = seen([round_bar()], poses=poses), HullParams()
+    near, far = np.array([[*GRIP, 0.045]]), np.array([[*(GRIP + 10.0), 0.045]])
+    hidden = _where_the_hand_hides(
+        silhouettes.masks, silhouettes.camera_from_hand, VIEW, near, params
+    )
+    assert 0 < hidden.mean() < 0.5
+    # as if the hand had been learnt as background there
+    spoilt = replace(silhouettes, masks=np.where(hidden, np.uint8(BACKGROUND), silhouettes.masks))
+
+    def left(spheres: Array) -> int:
+        about = visual_hull(spoilt, spheres, 0.3, params).voxels - GRIP
+        return int(((about @ AXIS > 0.05) & (about @ AXIS < 0.07)).sum())
+
+    assert left(near) > 4 * left(far)
 
 
 def test_nothing_that_moves_leaves_no_hull() -> None:

@@ -205,7 +205,7 @@ def test_every_other_frame_votes_where_there_are_many(
     monkeypatch.setattr(volume, "_VOTING_FRAMES", 3)
     hits, expected = volume._vote(small, small.points, rows, profiles, depths, SMALL)
     chosen = replace(small, points=small.points[half])
-    for index in product(range(2, len(axis) - 2, 2), repeat=3):
+    for index in product(range(len(axis)), repeat=3):
         seen, due = longhand_vote(chosen, rows[half], depths, profiles[half], axis[list(index)])
         if np.linalg.norm(axis[list(index)]) <= small.reach:
             assert expected[index] == 2 * due
@@ -213,20 +213,36 @@ def test_every_other_frame_votes_where_there_are_many(
     assert hits.max() > 0
 
 
-def test_every_cell_knows_its_nearest_edge(small: HandEdges) -> None:
+@pytest.mark.parametrize("every", [1, 2])
+def test_every_cell_knows_its_nearest_edge(small: HandEdges, every: int) -> None:
     rng = np.random.default_rng(3)
     crowded = rng.uniform(-0.05, 0.05, (240, 2))
     rows = small.moving.frame_of_edge
-    raster, nearest = volume._nearest_edges(small, crowded, rows, 1)
+    raster, nearest = volume._nearest_edges(small, crowded, rows, every)
     cells = np.round(raster[0] * crowded - raster[1:]).astype(int)
-    for row, v, u in np.argwhere(nearest >= 0)[::7]:
+    assert len(nearest) == len(small.moving.frames) / every
+    for row, v, u in np.argwhere(nearest >= 0)[::7] * (every, 1, 1):
         mine = np.abs(cells[rows == row] - (u, v))
         mine = np.square(mine[mine.max(axis=1) <= volume._SMEAR]).sum(axis=1)
-        edge = nearest[row, v, u]
+        edge = nearest[row // every, v, u]
         assert rows[edge] == row
         assert np.square(cells[edge] - (u, v)).sum() == mine.min()
-    for edge, (u, v) in enumerate(cells):
-        assert (nearest[rows[edge], v - 1 : v + 2, u - 1 : u + 2] >= 0).all()
+    for edge in np.flatnonzero(rows % every == 0):
+        u, v = cells[edge]
+        assert (nearest[rows[edge] // every, v - 1 : v + 2, u - 1 : u + 2] >= 0).all()
+
+
+def test_a_fine_voxel_is_divided_by_what_is_expected_of_the_coarse_one_about_it() -> None:
+    coarse, fine = grid_axis(0.2, SMALL.coarse), grid_axis(0.2, SMALL.fine)
+    expected = np.random.default_rng(4).uniform(30.0, 90.0, (len(coarse),) * 3).astype(np.float32)
+    middle = (2 * np.pi) ** -1.5  # of a Gaussian of one voxel
+    for place in np.array([[0.08, -0.12, 0.04], [-0.08, 0.12, -0.04]]):
+        shares = volume._recount(np.tile(place, (5, 1)), np.arange(5), expected, 0.2, SMALL)
+        index, about = (
+            tuple(np.round((place - axis[0]) / (axis[1] - axis[0])).astype(int))
+            for axis in (fine, coarse)
+        )
+        assert shares[index] * expected[about] == pytest.approx(5 * middle, rel=0.02)
 
 
 def trilinear(values: npt.NDArray[np.floating], at: Array) -> float | None:

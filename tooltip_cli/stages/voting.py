@@ -78,8 +78,9 @@ class Votes:
         known = int(views.known[self.detected.edges.frames].sum())
         if len(frames) < known or not views.known[frames].all():
             return None
-        poses = inverse_transform(views.hand_from_camera)
-        outlines = _hand_silhouettes(views.camera, seen.moving, poses)
+        poses, outlines = inverse_transform(views.hand_from_camera), seen.silhouettes
+        if outlines is not None:
+            outlines = replace(outlines, camera_from_hand=poses[frames])
         return replace(seen, camera_from_hand=poses, silhouettes=outlines)
 
 

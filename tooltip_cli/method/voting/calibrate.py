@@ -54,7 +54,8 @@ def calibrate(
     """Solve for what recordings of one robot share; None: no end can be fitted.
 
     How wide an end is is known roughly before clocks and camera are right. So it is solved for with
-    ends as wide as they seem, and wider, until enough fits; that with which most fits is returned.
+    ends as wide as they seem, and wider, until enough fits. Returned is what corrects something,
+    and of such the one with which most fits.
 
     Args:
         camera: whether the camera's pose may be corrected besides the clocks' offset. It is where

@@ -121,8 +121,10 @@ def residuals_of(system: System, unknowns: Array) -> tuple[Array, Array]:
     rows = np.flatnonzero(has)
     for offset, part in enumerate((first * u, first * w, second * w)):
         derivatives[rows, LINE + 3 * system.outline[rows] + offset] = (part / width)[rows]
-    residuals = system.targets - system.linear @ unknowns[:LINE] - np.where(has, width, 0.0)
-    return residuals, derivatives
+    residuals = system.targets.copy()
+    for column, unknown in zip(system.linear.T, unknowns, strict=False):  # in the kernel's order
+        residuals -= column * unknown
+    return residuals - np.where(has, width, 0.0), derivatives
 
 
 def solve(
@@ -171,7 +173,7 @@ def _added_up(
 ) -> tuple[Array, Array]:
     count, size = len(system.targets), len(unknowns)
     if frame_weights is None:
-        frame_weights = np.ones(int(system.frames.max()) + 1)
+        frame_weights = np.ones(int(system.frames.max(initial=-1)) + 1)
     normal, right = np.zeros((size, size)), np.zeros(size)
     machine_code.kernel(_KERNELS, "summer", _SUMMER)(
         system.targets,
@@ -207,7 +209,10 @@ def _plainly_added_up(
     residuals, derivatives = residuals_of(system, unknowns)
     weights = robust_weights(system, residuals, loss, params, frame_weights)
     weighted = derivatives * weights[:, None]
-    return weighted.T @ derivatives, weighted.T @ residuals
+    # row after row, as the kernel does: where ends disagree, rounding errors grow
+    rows = [np.add.reduce(column[:, None] * derivatives, axis=0) for column in weighted.T]
+    normal = np.tril(rows)
+    return normal + np.tril(normal, -1).T, np.add.reduce(weighted * residuals[:, None], axis=0)
 
 
 def robust_weights(
@@ -219,11 +224,12 @@ def robust_weights(
 ) -> Array:
     """Return (R,) Cauchy weights of residuals (R,), metres."""
     side, middle = system.kinds == SIDE, system.kinds == _MIDDLE
-    weights = np.where(side, params.side_weight, 1.0) / (loss**2 + np.square(residuals))
-    if frame_weights is not None:
-        weights *= frame_weights[system.frames]
+    counted = 1.0 if frame_weights is None else frame_weights[system.frames]
+    weights = counted / (loss * loss + residuals * residuals)
+    weights[side] *= params.side_weight
     weights[side & (residuals < 0)] *= params.missed_weight
     # where one side was missed, half the width is too small and the middle says nothing
-    odd = residuals[side].reshape(2, -1).mean(axis=0) / params.odd_width
-    weights[middle] /= np.square(1.0 + odd * odd)
+    left, right = residuals[side].reshape(2, -1)
+    odd = (left + right) / 2 / params.odd_width
+    weights[middle] /= (1.0 + odd * odd) * (1.0 + odd * odd)
     return np.asarray(weights)

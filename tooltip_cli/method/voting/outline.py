@@ -1,8 +1,8 @@
 """An end put right by the outlines of silhouettes: many starts, and the one that explains most.
 
-The equations are those of ``refine.py``. An outline has no edges inside it and hardly any gaps, so
-more images agree, and a start may be far off: all starts are tried on some of the images, and the
-best of them on all.
+The equations are those of ``equations.py``. An outline has no edges inside it and hardly any gaps,
+so more images agree, and a start may be far off: all starts are tried on some of the images, and
+the best of them on all.
 """
 
 from __future__ import annotations
