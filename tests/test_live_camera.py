@@ -187,8 +187,8 @@ def test_a_stream_of_ffmpeg_is_taken_without_its_backlog(tmp_path: Path) -> None
         ended(recording)
         sender.kill()
     stamps = [m.log_time_ns for m in by_topic(out)[IMAGES]]
-    # in 2 s at 25 Hz; what waited in the stream while it was opened would come on top, at once
-    assert 10 < len(stamps) < 60
+    # at 25 Hz, a busy machine stops late; what waited during the opening would come at once
+    assert 10 < len(stamps) < 25 * (stamps[-1] - stamps[0]) / 1e9 + 10
     assert stamps == sorted(set(stamps))
 
 
