@@ -108,7 +108,9 @@ def test_an_end_is_measured_without_a_compiler_as_with_one(
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_normal_equations_without_a_compiler_are_the_same(weighted: bool) -> None:
+def test_normal_equations_without_a_compiler_are_the_same(
+    no_compiler: pytest.MonkeyPatch, weighted: bool
+) -> None:
     rng = np.random.default_rng(0)
     poses = poses_of(rng.uniform(-1.0, 1.0, (30, 3)))
     none = NearEdges(
@@ -121,10 +123,13 @@ def test_normal_equations_without_a_compiler_are_the_same(weighted: bool) -> Non
     )
     unknowns = rng.normal(0.0, 0.003, (system.prior.shape[1],))
     frames = rng.integers(0, 3, 30).astype(float) if weighted else None
-    plain, compiled = (
-        form(system, unknowns, 0.002, RefineParams(), frames)
-        for form in (equations._plainly_added_up, equations._added_up)
-    )
+
+    def summed() -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        return equations._normal_equations(system, unknowns, 0.002, RefineParams(), frames)
+
+    plain = summed()
+    no_compiler.undo()
+    compiled = summed()
     for one, other in zip(plain, compiled, strict=True):
         np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(compiled[0], compiled[0].T)
@@ -170,7 +175,7 @@ def test_half_an_edge_is_left_out_to_even_with_and_without_a_compiler() -> None:
     limits = np.array([[-0.01, 0.01]])
     sides = []
     for measured in (
-        machine_code.kernel(loops._ENDS, "measurer", sight._MEASURER),
+        machine_code.kernel(loops.ENDS, "measurer", sight._MEASURER),
         loops._measure,
     ):
         stops, (middles, halves) = np.full(4, np.nan), np.full((2, 4, 1), np.nan)

@@ -75,12 +75,12 @@ def chooser() -> Callable[..., int]:
     return choose
 
 
-def _smallest(values: Any, low: int, high: int, rank: int) -> float:
-    """Return the value that would be at ``rank`` if values[low:high] were sorted; moves them.
+def _smallest(values: Any, count: int, rank: int) -> float:
+    """Return the value that would be at ``rank`` if values[:count] were sorted; moves them.
 
     Hoare's selection.
     """
-    left, right = low, high - 1
+    left, right = np.int64(0), count - 1
     while left < right:
         pivot = values[rank]
         i, j = left, right
@@ -160,8 +160,8 @@ def measurer() -> Callable[..., int]:
                 skipped = np.int64(math.floor(share + 0.5))
                 if skipped - share == 0.5:  # to even, as numpy rounds
                     skipped -= skipped % 2
-                left = _smallest(values, 0, found, skipped)
-                right = _smallest(values, 0, found, found - 1 - skipped)
+                left = _smallest(values, found, skipped)
+                right = _smallest(values, found, found - 1 - skipped)
                 middles[frame * slabs + slab] = (left + right) / 2
                 halves[frame * slabs + slab] = (right - left) / 2
         return 0

@@ -72,11 +72,10 @@ class Votes:
     def moved(self, seen: HandEdges, views: Views) -> HandEdges | None:
         """Return edges that were seen by one rig as another sees them, without undistorting again.
 
-        None: one of the rigs knows the poses of fewer images.
+        None: the rigs know the poses of different images.
         """
-        frames = seen.moving.frames
-        known = int(views.known[self.detected.edges.frames].sum())
-        if len(frames) < known or not views.known[frames].all():
+        frames, detected = seen.moving.frames, self.detected.edges.frames
+        if not np.array_equal(frames, detected[views.known[detected]]):
             return None
         poses, outlines = inverse_transform(views.hand_from_camera), seen.silhouettes
         if outlines is not None:

@@ -21,6 +21,7 @@ import numpy as np
 
 from tooltip_cli import machine_code
 from tooltip_cli.method.types import Array, Indices
+from tooltip_cli.method.voting.loops import ENDS
 from tooltip_cli.method.voting.params import RefineParams
 from tooltip_cli.method.voting.sight import Measured, Sight, across_axis
 
@@ -31,7 +32,6 @@ _TINY = 1e-8  # m^2, keeps the root of no width differentiable
 _STEP_PRIOR, _OFFSET_PRIOR, _TURN_PRIOR, _RADIUS_PRIOR, _TAPER_PRIOR = (
     0.004, 0.010, 0.15, 0.006, 0.004,
 )  # fmt: skip
-_KERNELS = "tooltip_cli.method._ends_numba"
 _SUMMER = "f64* f64* f64* i64* i64* i64* i64 i64 f64* i64 f64 f64 f64 f64 f64* f64* f64* f64* f64*"
 
 
@@ -157,62 +157,43 @@ def _normal_equations(
     frame_weights: Array | None,
 ) -> tuple[Array, Array]:
     """Return (U, U) and (U,) of one step, without the prior."""
-    return machine_code.fast_or_slow(
-        lambda: _added_up(system, unknowns, loss, params, frame_weights),
-        lambda: _plainly_added_up(system, unknowns, loss, params, frame_weights),
-        None,
-    )
 
+    def compiled() -> tuple[Array, Array]:
+        count, size = len(system.targets), len(unknowns)
+        normal, right = np.zeros((size, size)), np.zeros(size)
+        machine_code.kernel(ENDS, "summer", _SUMMER)(
+            system.targets,
+            system.linear,
+            system.seen_along,
+            system.outline,
+            system.kinds,
+            system.frames,
+            count,
+            system.sides,
+            unknowns,
+            size,
+            loss,
+            params.side_weight,
+            params.missed_weight,
+            params.odd_width,
+            np.ones(system.frames.max(initial=-1) + 1) if frame_weights is None else frame_weights,
+            np.empty(count),
+            np.empty(size),
+            normal,
+            right,
+        )
+        return normal + np.tril(normal, -1).T, right
 
-def _added_up(
-    system: System,
-    unknowns: Array,
-    loss: float,
-    params: RefineParams,
-    frame_weights: Array | None,
-) -> tuple[Array, Array]:
-    count, size = len(system.targets), len(unknowns)
-    if frame_weights is None:
-        frame_weights = np.ones(int(system.frames.max(initial=-1)) + 1)
-    normal, right = np.zeros((size, size)), np.zeros(size)
-    machine_code.kernel(_KERNELS, "summer", _SUMMER)(
-        system.targets,
-        system.linear,
-        system.seen_along,
-        system.outline,
-        system.kinds,
-        system.frames,
-        count,
-        system.sides,
-        unknowns,
-        size,
-        loss,
-        params.side_weight,
-        params.missed_weight,
-        params.odd_width,
-        frame_weights,
-        np.empty(count),
-        np.empty(size),
-        normal,
-        right,
-    )
-    return normal + np.tril(normal, -1).T, right
+    def plain() -> tuple[Array, Array]:
+        residuals, derivatives = residuals_of(system, unknowns)
+        weights = robust_weights(system, residuals, loss, params, frame_weights)
+        weighted = derivatives * weights[:, None]
+        # row after row, as the kernel does: where ends disagree, rounding errors grow
+        rows = [np.add.reduce(column[:, None] * derivatives, axis=0) for column in weighted.T]
+        normal = np.tril(rows)
+        return normal + np.tril(normal, -1).T, np.add.reduce(weighted * residuals[:, None], axis=0)
 
-
-def _plainly_added_up(
-    system: System,
-    unknowns: Array,
-    loss: float,
-    params: RefineParams,
-    frame_weights: Array | None,
-) -> tuple[Array, Array]:
-    residuals, derivatives = residuals_of(system, unknowns)
-    weights = robust_weights(system, residuals, loss, params, frame_weights)
-    weighted = derivatives * weights[:, None]
-    # row after row, as the kernel does: where ends disagree, rounding errors grow
-    rows = [np.add.reduce(column[:, None] * derivatives, axis=0) for column in weighted.T]
-    normal = np.tril(rows)
-    return normal + np.tril(normal, -1).T, np.add.reduce(weighted * residuals[:, None], axis=0)
+    return machine_code.fast_or_slow(compiled, plain, None)
 
 
 def robust_weights(

@@ -292,12 +292,12 @@ def _ranked(rows: Indices, values: Array, frames: int) -> tuple[Array, Indices, 
     return values[np.lexsort((values, rows))], np.cumsum(counts) - counts, counts
 
 
-_VOTING, _ENDS = "tooltip_cli.method._voting_numba", "tooltip_cli.method._ends_numba"
+_VOTING, ENDS = "tooltip_cli.method._voting_numba", "tooltip_cli.method._ends_numba"
 _LOOPS: dict[str, tuple[str, Callable[..., int]]] = {
     "profiler": (_VOTING, _profile),
     "voter": (_VOTING, _vote),
     "placer": (_VOTING, _place),
     "carver": (_VOTING, _carve),
-    "chooser": (_ENDS, _choose),
-    "measurer": (_ENDS, _measure),
+    "chooser": (ENDS, _choose),
+    "measurer": (ENDS, _measure),
 }
